@@ -14,9 +14,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fgreg.drivers.base import CommandKind, DeviceLost, OperatorCommand, RefusedWord
+from fgreg.drivers.base import CommandKind, DeviceLost, OperatorCommand, RefusedWord, host_now
 from fgreg.drivers.line_editor import LineEditor
-from fgreg.drivers.operator_words import asked, understand
+from fgreg.drivers.operator_words import MOST_AGE_S, asked, understand
 from fgreg.drivers.word_queue import WordQueue
 from fgreg.schema.limits import TYPED_LINE_BYTES
 
@@ -52,6 +52,7 @@ class KeyboardOperator:
         self._fd = standard_input() if fd is None else fd
         self._editor = None if typing is None or self._fd is None or not os.isatty(self._fd) else LineEditor()
         self._queue, self._open = WordQueue(), self._fd is not None
+        self._said_s: float | None = None  # of the lines that are read now; None: just now
         self._wake, self._woken = os.pipe()  # ends, in this order: read, write
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="keyboard", daemon=True)
@@ -91,11 +92,11 @@ class KeyboardOperator:
             os.close(end)
 
     def _run(self) -> None:
-        held, too_long = b"", False
+        held, too_long = b"", False  # of a line that is too long the end is held, which may say stop
         if self._typing is not None:
             self._typing("")
         while self._open and not self._closed:
-            data = self._read()
+            data = self._new_data()
             if data is None:
                 continue
             if self._editor is not None and self._typing is not None and data:
@@ -111,31 +112,42 @@ class KeyboardOperator:
                 self._take(line, too_long or len(line) > TYPED_LINE_BYTES)
                 too_long = False
             if len(held) > TYPED_LINE_BYTES:
-                held, too_long = b"", True
+                held, too_long = held[-TYPED_LINE_BYTES:], True
 
-    def _read(self) -> bytes | None:
+    def _new_data(self) -> bytes | None:
+        """As :meth:`_read`. What came while this program was held up may have been typed when that began."""
+        began_s = host_now()
+        data = self._read(BACKGROUND_S)
+        late = host_now() - began_s > BACKGROUND_S + MOST_AGE_S
+        if late and data is None:
+            data = self._read(0.0)
+        self._said_s = began_s if late else None
+        return data
+
+    def _read(self, wait_s: float) -> bytes | None:
         """New bytes; empty at the end of the input; None if nothing came, or reading is not allowed now."""
         fd = self._fd
         if fd is None:
             return b""
         try:
             if not in_foreground(fd):
-                select.select([self._wake], [], [], BACKGROUND_S)
+                select.select([self._wake], [], [], wait_s)
                 return None
-            ready, _, _ = select.select([fd, self._wake], [], [], BACKGROUND_S)
+            ready, _, _ = select.select([fd, self._wake], [], [], wait_s)
             return os.read(fd, 4096) if fd in ready and in_foreground(fd) else None
         except (OSError, ValueError):  # the terminal hung up, or the file was closed
             return b""
 
     def _take(self, line: bytes, too_long: bool) -> None:
-        if too_long:
-            self._say(f"a line of more than {TYPED_LINE_BYTES} characters is not understood")
-            return
         command = understand(line.decode("utf-8", errors="replace"), self._corners)
+        stops = isinstance(command, OperatorCommand) and command.kind is CommandKind.STOP
+        if too_long and not stops:
+            command = f"a line of more than {TYPED_LINE_BYTES} characters is not understood"
         if isinstance(command, str):
             self._say(command)
             return
-        self._queue.put(replace(command, peer=self.name))
+        said_s = command.said_s if stops or self._said_s is None else self._said_s
+        self._queue.put(replace(command, peer=self.name, said_s=said_s))
 
 
 def standard_input() -> int | None:

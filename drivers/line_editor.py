@@ -20,7 +20,10 @@ class LineEditor:
         return self._held.decode("utf-8", errors="replace")
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take in bytes; returns the lines that they end. A line that is too long is cut behind the limit."""
+        """Take in bytes; returns the lines that they end.
+
+        Of a line that is too long the end is kept, one byte more than the limit.
+        """
         lines = []
         for byte in data:
             if self._in_sequence(byte):
@@ -35,8 +38,9 @@ class LineEditor:
                 self._held.clear()
             elif byte == _KILL_WORD:
                 del self._held[self._held.rstrip().rfind(b" ") + 1 :]
-            elif byte >= 0x20 and len(self._held) <= TYPED_LINE_BYTES:
+            elif byte >= 0x20:
                 self._held.append(byte)
+                del self._held[: -TYPED_LINE_BYTES - 1]
         return lines
 
     def _in_sequence(self, byte: int) -> bool:

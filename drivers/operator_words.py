@@ -55,7 +55,6 @@ _WORDS: dict[str, CommandKind] = {**{said.value: said for said in CommandKind}, 
 _NUMBER = re.compile(r"[0-9]{1,3}")
 _DECIMAL = re.compile(r"-?[0-9]{1,4}(\.[0-9]{1,6})?")
 _PM = re.compile(r"[0-9]{1,9}")
-_STOP = re.compile(r"\bstop\b")
 _EFFECT = {CommandKind.EXCLUDE: "no longer count", CommandKind.INCLUDE: "count again"}
 CANCELLED = "a stop came after it: say it again"
 
@@ -63,14 +62,15 @@ CANCELLED = "a stop came after it: say it again"
 def understand(line: str, corners: tuple[int, int] | None = None) -> OperatorCommand | str:
     """Parse a line into a command; returns a message with what was expected if that fails.
 
-    A line with the word ``stop`` anywhere is a stop, and so is an empty line: stopping needs no correct spelling.
+    A line with ``stop`` anywhere, also inside another word, is a stop, and so is an empty line: stopping needs no
+    correct spelling.
 
     Args:
         line: as typed; case does not matter.
         corners: columns and rows of the board's inner corners, to check an aim against; None for no check.
     """
     words = line.lower().replace(",", " ").split()
-    if not words or _STOP.search(line.lower()):
+    if not words or str(CommandKind.STOP) in line.lower():
         return OperatorCommand(CommandKind.STOP)
     said = _WORDS.get(words[0])
     if said is None:
@@ -119,16 +119,17 @@ def asked(text: str, wants: CommandKind | None) -> str:
 
 
 def in_force(
-    said: Sequence[OperatorCommand | RefusedWord], now_s: float
+    said: Sequence[OperatorCommand | RefusedWord], now_s: float, stopped_s: float = float("-inf")
 ) -> tuple[list[OperatorCommand], list[RefusedWord]]:
     """The words that count now, with a stop first, and those that are refused.
 
-    Refused are words older than :data:`MOST_AGE_S`, and those that let the stage move if a stop came after them.
+    Refused are words older than :data:`MOST_AGE_S`, and those that let the stage move if a stop came after them: one of
+    these, or one before at ``stopped_s``.
     """
     commands = [word for word in said if isinstance(word, OperatorCommand)]
     refused = [word for word in said if isinstance(word, RefusedWord)]
     stops = [command for command in commands if command.kind is CommandKind.STOP]
-    stopped_s = max((stop.said_s for stop in stops), default=float("-inf"))
+    stopped_s = max([stopped_s, *(stop.said_s for stop in stops)])
     kept = stops[-1:]
     for command in commands:
         if command.kind is CommandKind.STOP:

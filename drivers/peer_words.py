@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fgreg.drivers.base import CommandKind, OperatorCommand, RefusedWord
-from fgreg.drivers.operator_words import MOTIONS, understand
+from fgreg.drivers.operator_words import MOST_AGE_S, MOTIONS, understand
 from fgreg.drivers.word_keys import read_key, signed_word, why_not
 from fgreg.schema.problems import FieldError
 
@@ -28,7 +28,7 @@ class PeerWords:
         words: what it may say beside ``stop``; None for all.
         key: that its words are signed with; None for no key.
         corners: columns and rows of the board's inner corners.
-        began_s: words signed before this time (s since 1970) are refused, since their counters are not known.
+        began_s: words signed before this time (s since 1970) are refused (``word_keys.why_not``).
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class PeerWords:
     def of(cls, words: Sequence[str] | None, key: Path | None, corners: tuple[int, int] | None) -> PeerWords:
         """As a configuration has them. Raises InputError for a key that cannot be used."""
         kinds = None if words is None else [CommandKind(word) for word in words]
-        return cls(kinds, None if key is None else read_key(key), corners, time.time())
+        return cls(kinds, None if key is None else read_key(key), corners, time.time() + MOST_AGE_S)
 
     def take(self, line: str, peer: str, arrived_s: float, now_s: float) -> OperatorCommand | RefusedWord | str:
         """A line as a command, as one that is refused, or what to answer where it is not understood.

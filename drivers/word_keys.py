@@ -23,6 +23,8 @@ EXPECTED_KEY = (
     f"a file of {LEAST_KEY_BYTES} to {MOST_KEY_BYTES} bytes that only its owner can read: "
     "openssl rand -hex 32 > FILE; chmod 600 FILE"
 )
+_READ = os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Without waiting, where it is a pipe that no one writes to."""
 _SIGNED = re.compile(r"([^;]*);([0-9]{1,19});([0-9]{1,12}(?:\.[0-9]{1,9})?);([0-9a-f]{64})\s*")
 
 
@@ -67,7 +69,8 @@ def why_not(said: SignedWord, key: bytes, last_counter: int, now_s: float, began
         key: of the peer.
         last_counter: of the last word that counted; -1 before the first.
         now_s: seconds since 1970.
-        began_s: the same when this program began, which knows no earlier counters.
+        began_s: the same from which on words count, since earlier counters are not known: MOST_AGE_S after the start,
+            as the word of a clock that is ahead may have counted before.
     """
     if not hmac.compare_digest(_signature(said.signed, key), said.signature):
         return "its signature is wrong: has the sender the same key?"
@@ -99,7 +102,7 @@ def read_key(path: Path) -> bytes:
         return InputError(str(path), found, EXPECTED_KEY)
 
     try:
-        with path.open("rb") as file:
+        with os.fdopen(os.open(path, _READ), "rb") as file:
             kept = os.fstat(file.fileno())
             if not stat.S_ISREG(kept.st_mode):
                 raise refused("no ordinary file")

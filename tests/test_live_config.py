@@ -445,6 +445,12 @@ def test_two_operators_have_two_keys(tmp_path: Path) -> None:
     key.chmod(0o600)
     assert "operator[1]" in (error := error_of(live_configs.write(tmp_path, data)))
     assert "the key a.key again, expected another key than live.yaml: operator[0]" in error
+    (tmp_path / "b.key").write_bytes(key.read_bytes() + b"\n")  # a copy is no other key
+    (tmp_path / "b.key").chmod(0o600)
+    data["operator"][1]["key"] = "b.key"
+    assert "the key b.key again, expected another key than live.yaml: operator[0]" in error_of(
+        live_configs.write(tmp_path, data)
+    )
     data["operator"] = {"driver": "igtl", "words": ["next", "home"]}
     assert "found home without a key, expected a key beside it" in error_of(live_configs.write(tmp_path, data))
 

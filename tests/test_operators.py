@@ -16,14 +16,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fgreg.drivers import keyboard
 from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand, RefusedWord, host_now
 from fgreg.drivers.keyboard import KeyboardOperator
+from fgreg.drivers.line_editor import LineEditor
 from fgreg.drivers.operator_words import AFTER, EXPECTED, LETTERS, MOST_AGE_S, asked, in_force, understand
 from fgreg.drivers.operators import IgtlOperator, Operators
 from fgreg.drivers.peer_words import PeerWords
 from fgreg.drivers.tcp_link import Endpoint
 from fgreg.drivers.word_keys import sign
 from fgreg.drivers.word_queue import MOST_WAITING, WordQueue
+from fgreg.live.heard_words import HeardWords
 from fgreg.schema.limits import TYPED_LINE_BYTES
 from tests.igtl_bytes import message, read_messages
 from tests.network_peers import collect, wait_for
@@ -92,7 +95,9 @@ def test_what_is_not_understood_is_answered_with_what_is_expected(line: str, exp
     assert answer.isprintable()
 
 
-@pytest.mark.parametrize("line", ["", "   ", "\r", "stop", "STOP!", "x", "please stop", "stop the stage, now"])
+@pytest.mark.parametrize(
+    "line", ["", "   ", "\r", "stop", "STOP!", "x", "please stop", "stop the stage, now", "nonstop"]
+)
 def test_a_stop_need_not_be_spelt(line: str) -> None:
     assert understand(line) == OperatorCommand(CommandKind.STOP)
 
@@ -172,6 +177,26 @@ def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -
     typed.type(b"\nfollow\n")
     assert collect(typed.operator.poll, 1) == [OperatorCommand(CommandKind.FOLLOW)]
     assert typed.messages == [f"a line of more than {TYPED_LINE_BYTES} characters is not understood"]
+    # Something lay on the keyboard, and then came a stop.
+    typed.type(b"a" * 3 * TYPED_LINE_BYTES + b"stop\n")
+    assert collect(typed.operator.poll, 1) == [OperatorCommand(CommandKind.STOP)]
+    assert understand(LineEditor().feed(b"a" * 3 * TYPED_LINE_BYTES + b"stop\r")[0].decode()) == OperatorCommand(
+        CommandKind.STOP
+    )
+
+
+def test_what_was_typed_while_the_program_was_held_up_is_as_old_as_that(
+    typed: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(10**6))
+    monkeypatch.setattr(keyboard, "host_now", lambda: host_now() + 2.0 * next(clock))  # each call 2 s after the last
+    typed.type(b"moved\n")  # the read that is under way began before
+    collect(typed.operator.poll, 1)
+    typed.type(b"home\n")
+    (home,) = collect(typed.operator.poll, 1)
+    assert isinstance(home, OperatorCommand)
+    assert home.said_s > host_now() + 1.0  # by that clock, which is ahead
+    assert in_force([home], home.said_s + 2.0)[0] == []
 
 
 def test_commands_not_fetched_are_dropped_oldest_first_but_never_a_stop(typed: Typed) -> None:
@@ -352,6 +377,15 @@ def test_a_stop_cancels_the_motions_asked_for_before_it_and_nothing_else() -> No
     # Of another operator: what was said before the stop is cancelled in whatever order the two are asked.
     words = [OperatorCommand(CommandKind.STOP, said_s=100.0), OperatorCommand(CommandKind.HOME, said_s=99.9)]
     assert in_force(words, 100.1)[0] == words[:1]
+    # The same of a word that was under way when the stop came.
+    heard = HeardWords()
+    heard.add(words[:1])
+    assert heard.take(100.1) == (words[0],)
+    heard.add(words[1:])
+    assert heard.take(100.2) == ()
+    assert heard.refused == "home from the operator is refused: a stop came after it: say it again"
+    heard.add([OperatorCommand(CommandKind.HOME, said_s=100.2)])
+    assert len(heard.take(100.3)) == 1
 
 
 @pytest.mark.parametrize("kind", CommandKind)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fgreg.drivers.base import CommandKind, OperatorCommand, RefusedWord
-from fgreg.drivers.operator_words import MOTIONS
+from fgreg.drivers.operator_words import MOST_AGE_S, MOTIONS
 from fgreg.drivers.options import IgtlOperatorOptions
 from fgreg.drivers.peer_words import PeerWords, check_operator
 from fgreg.drivers.word_keys import read_key, sign
@@ -111,6 +111,17 @@ def test_a_key_is_the_file_without_its_newline(tmp_path: Path) -> None:
         read_key(tmp_path)
     with pytest.raises(InputError, match="No such file"):
         read_key(tmp_path / "none.key")
+    os.mkfifo(tmp_path / "pipe.key", 0o600)  # no one writes to it
+    with pytest.raises(InputError, match="no ordinary file"):
+        read_key(tmp_path / "pipe.key")
+
+
+def test_a_word_that_counted_before_a_restart_counts_in_no_later_session(tmp_path: Path) -> None:
+    now = time.time()
+    ahead = sign("home", KEY, 7, now + 0.9 * MOST_AGE_S)  # of a clock that is ahead
+    assert refusal(PeerWords(key=KEY), ahead, now) == ""
+    begun = PeerWords.of(None, key_file(tmp_path, KEY), None)
+    assert "before this session began" in refusal(begun, ahead, now + 0.1)
 
 
 def test_words_that_need_a_key_are_refused_without_one(tmp_path: Path) -> None:

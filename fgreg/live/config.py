@@ -14,8 +14,15 @@ from typing import Any
 
 from fgreg.convert.write import camera_yaml
 from fgreg.drivers.base import DriverContext, Operator
-from fgreg.drivers.options import Connection, EndoscopeOptions, NoOptions
+from fgreg.drivers.options import (
+    Connection,
+    EndoscopeOptions,
+    IgtlOperatorOptions,
+    NoOptions,
+    Ros2OperatorOptions,
+)
 from fgreg.drivers.registry import SEVERAL, DriverEntry, Role, drivers_of
+from fgreg.drivers.word_keys import read_key
 from fgreg.errors import InputError
 from fgreg.live.config_keys import LIVE, CalibrationOptions, LiveDocument, LiveSettings, RoomOptions
 from fgreg.live.launch import LiveSetup, StageSetup, setup_text
@@ -395,13 +402,13 @@ def _check_ports(devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
 
 def _check_keys(devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
     """Check that each operator has a key of its own: a word signed for one counts for no other. Raises InputError."""
-    taken: dict[Path, str] = {}
+    taken: dict[bytes, str] = {}
     for chosen in devices[Role.OPERATOR]:
-        path = getattr(chosen.options, "key", None)
-        if not isinstance(path, Path):
+        options = chosen.options
+        if not isinstance(options, IgtlOperatorOptions | Ros2OperatorOptions) or options.key is None:
             continue
-        if (first := taken.setdefault(path.resolve(), chosen.where)) is not chosen.where:
-            raise InputError(chosen.where, f"the key {path.name} again", f"another key than {first}'s")
+        if (first := taken.setdefault(read_key(options.key), chosen.where)) is not chosen.where:
+            raise InputError(chosen.where, f"the key {options.key.name} again", f"another key than {first}'s")
 
 
 def _open_to_all(devices: Mapping[Role, tuple[Chosen, ...]]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from fgreg.drivers.base import OperatorCommand, RefusedWord
+from fgreg.drivers.base import CommandKind, OperatorCommand, RefusedWord
 from fgreg.drivers.operator_words import in_force
 
 NOTE_S = 1.0
@@ -23,6 +23,7 @@ class HeardWords:
     def __init__(self) -> None:
         self._waiting: list[OperatorCommand | RefusedWord] = []
         self._noted_s, self._more, self._unnoted = -math.inf, 0, ""
+        self._stopped_s = -math.inf
         self.last, self.refused = "", ""
 
     def add(self, words: Sequence[OperatorCommand | RefusedWord]) -> None:
@@ -31,9 +32,11 @@ class HeardWords:
 
     def take(self, now_s: float) -> tuple[OperatorCommand, ...]:
         """The words in force now (host time), a stop first."""
-        kept, refused = in_force(self._waiting, now_s)
+        kept, refused = in_force(self._waiting, now_s, self._stopped_s)
         self._waiting = []
         for command in kept:
+            if command.kind is CommandKind.STOP:  # a word that was said before it may still be on its way
+                self._stopped_s = max(self._stopped_s, command.said_s)
             self.refused = ""
             self.last = f"{command.kind} from {command.peer or 'the operator'}"
         for word in refused:
