@@ -10,12 +10,13 @@ What is published of a registration (lengths in metres, as REP-103 says):
 | ``/tf``, or ``/tf_static`` | TFMessage | usable: ``camera`` in ``trus`` |
 | ``/fgreg/registration`` | PoseWithCovarianceStamped | usable: the same, with its covariance |
 
-A refused registration is on the first topic only. Receivers keep the last transform: the verdict says that it is out
-of date.
+A refused registration is on the first topic only, and who listens to ``/tf_static`` from then on gets no transform.
+Receivers keep the last transform that they got: the verdict says that it is out of date.
 """
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
@@ -142,6 +143,11 @@ class _Ros2Source:
         """Number of messages left out: of another type, invalid, overtaken."""
         return self._topic.rejections.count
 
+    @property
+    def last_rejection(self) -> str:
+        """Why the last one was left out."""
+        return f"{self.name}: {self._topic.rejections.last}"
+
     def close(self) -> None:
         """End the connection."""
         self._topic.close()
@@ -227,15 +233,19 @@ class Ros2Operator(_Ros2Source):
         """A message, in the link's thread. Raises ValueError for a word that is not understood."""
         word = self._words.take(str(message.data), self._peer, host_now(), time.time())
         if isinstance(word, str):
-            self._send(ros.text(word))
+            self._answer(word)
             raise ValueError(word)
-        if isinstance(word, RefusedWord):
-            self._send(ros.text(word.text))
         self._queue.put(word)
+        if isinstance(word, RefusedWord):
+            self._answer(word.text)
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
         """Send a message."""
-        self._send(ros.text(asked(text, wants)))
+        self._answer(asked(text, wants))
+
+    def _answer(self, text: str) -> None:
+        with contextlib.suppress(DeviceLost):  # as for any receiver that is not there
+            self._send(ros.text(text))
 
 
 class Ros2Sink:
@@ -272,6 +282,8 @@ class Ros2Sink:
             parent, child = self._options.parent, self._options.child
             self._send_transform(ros.transform_message(pose, parent, child, unix_s))
             self._send_pose(ros.pose_message(pose, _finite(registration.covariance), parent, unix_s))
+        else:
+            self._send_transform(None)  # whom the static one would reach later must not get it any more
         was, self._heard = self._heard, self.connected
         if was and not self._heard:
             raise DeviceLost(f"transform sink: {self.name}: no one listens any more")

@@ -2,12 +2,13 @@
 
 The joint's position is the stage's own angle (rad). CRTK has no speed in ``move_jp``: it is sent as the joint's
 velocity, and a device that turns faster is stopped by the safety gate. It stops by the command ``pause`` together with
-a goal where it stands, repeated until it stands; the next order resumes it first. Statuses are the device's newest
-messages: it publishes by itself.
+a goal where it stands, repeated until it stands; the next order resumes it first. A device that has fallen silent is
+told to stop before it is given up. Statuses are the device's newest messages: it publishes by itself.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -102,6 +103,8 @@ class Ros2Stage:
             waiting, rejected = self._waiting, self._rejected
         if silent > LOST_S:
             besides = f"; left out: {rejected}" if rejected else ""
+            with contextlib.suppress(StageLost):
+                self._stop_now()  # where only its messages are lost, it still hears this
             raise self._give_up(f"has said nothing for {LOST_S:g} s: is its node running?{besides}")
         busy = bool(state.is_busy)
         moving = busy or abs(velocity) > STANDS_RAD_S

@@ -26,6 +26,10 @@ LEFT_S = 0.1
 """A topic without publishers is lost after this time without a message: those under way still arrive."""
 
 
+MOST_LOSSES = 8
+"""Largest number of losses that wait to be raised."""
+
+
 class Topic:
     """A subscription.
 
@@ -62,7 +66,7 @@ class Topic:
         self._state = threading.Condition()
         self._arrived_s = host_now()
         self._alive = self._reported = self._closed = self._counted = False
-        self._losses: list[str] = []
+        self._losses: deque[str] = deque(maxlen=MOST_LOSSES)
         self._last_s = -float("inf")
         self.ended = False
         self._thread = threading.Thread(target=self._run, name=f"ROS 2 {topic}", daemon=True)
@@ -85,7 +89,7 @@ class Topic:
         """Items since the last call, oldest first. Raises DeviceLost once for each loss."""
         with self._state:
             if self._losses:
-                raise DeviceLost(self._losses.pop(0))
+                raise DeviceLost(self._losses.popleft())
             found = list(self._items)
             self._items.clear()
             if found:
@@ -146,7 +150,7 @@ class Topic:
         try:
             found = list(self._read(decode(data, kind)))
             items = [self._item(message, value, host_s, index) for message, value in found]
-        except (ValueError, TypeError, AttributeError, ArithmeticError, IndexError) as error:
+        except Exception as error:  # of a parser on foreign bytes; the next message may be good
             with self._state:
                 self.rejections.add(one_line(str(error), 200))
             return

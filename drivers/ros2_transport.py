@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
-from fgreg.drivers.base import host_now
+from fgreg.drivers.base import DeviceLost, host_now
 from fgreg.errors import FgregError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 Take = Callable[[bytes, str, float], None]
 """Called with a message's bytes, its type as far as the sender says it, and its time of arrival; in any thread."""
+Send = Callable[[bytes | None], None]
+"""Sends a message and never waits; None withdraws the one that a latched topic keeps. Raises DeviceLost where the link
+does not take it."""
 NODE = "fgreg"
 RETRY_MS = 200
 """Between attempts to reach the router."""
@@ -44,8 +47,8 @@ class Transport(Protocol):
     def subscribe(self, topic: str, kind: str, take: Take, latched: bool = False) -> None:
         """Call ``take`` with each message; ``latched``: also with the last one before now, if the topic keeps it."""
 
-    def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Callable[[bytes], None]:
-        """A function that sends a message and never waits. Later subscribers get the last one of a latched topic."""
+    def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Send:
+        """A function that sends messages. Later subscribers get the last one of a latched topic."""
 
     def publishers(self, topic: str) -> int:
         """Number of nodes that publish on a topic."""
@@ -153,7 +156,7 @@ class ZenohTransport:
 
         self._when_open(declare)
 
-    def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Callable[[bytes], None]:
+    def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Send:
         """Messages that the link does not take at once are dropped, by Zenoh's congestion control."""
         zenoh = self._zenoh
         key = f"{self._domain}/{topic.strip('/')}/{dds_type(kind)}/{self._hash_of(kind)}"
@@ -162,31 +165,56 @@ class ZenohTransport:
             quality["priority"] = zenoh.Priority.REAL_TIME
         self._entity("MP", topic, kind, latched)
         self._watch("MS", topic)
+        turn = threading.RLock()
         made: list[Any] = []
-        last: list[bytes] = []  # of a latched topic, before the session is open
+        last: list[bytes] = []  # of a latched topic, before its publisher is declared
+        gid, number, declared = os.urandom(16), 0, True
 
         def declare() -> None:
-            if latched:
-                quality.update(cache=self._ext.CacheConfig(max_samples=1), publisher_detection=True)
-                publisher = self._ext.declare_advanced_publisher(self._session, key, **quality)
-            else:
-                publisher = self._session.declare_publisher(key, **quality)
-            made.append(publisher)
-            self._kept.append(publisher)
-            for data in last:
-                send(data)
+            with turn:
+                if latched:
+                    quality.update(cache=self._ext.CacheConfig(max_samples=1), publisher_detection=True)
+                    publisher = self._ext.declare_advanced_publisher(self._session, key, **quality)
+                else:
+                    publisher = self._session.declare_publisher(key, **quality)
+                made.append(publisher)
+                self._kept.append(publisher)
+                while last:
+                    put(last.pop())
 
-        gid, number = os.urandom(16), 0
-
-        def send(data: bytes) -> None:
+        def put(data: bytes) -> None:
             nonlocal number
+            made[0].put(data, attachment=struct.pack("<qqB16s", number, time.time_ns(), 16, gid))
+            number += 1
+
+        def withdraw() -> None:
+            nonlocal declared
+            last.clear()
+            if made:  # its cache ends with the publisher
+                publisher, declared = made.pop(), False
+                self._kept.remove(publisher)
+                publisher.undeclare()
+
+        def send(data: bytes | None) -> None:
+            nonlocal declared
             if self._end.is_set():
                 return
-            if made:
-                made[0].put(data, attachment=struct.pack("<qqB16s", number, time.time_ns(), 16, gid))
-                number += 1
-            elif latched:
-                last[:] = [data]
+            try:
+                with turn:
+                    if data is None:
+                        withdraw() if latched else None
+                        return
+                    if made:
+                        put(data)
+                        return
+                    if not latched:
+                        return
+                    last[:] = [data]
+                    again, declared = not declared, True
+                if again:
+                    self._when_open(declare)
+            except self._zenoh.ZError as error:
+                raise DeviceLost(f"{topic}: the link takes no message: {error}") from error
 
         self._when_open(declare)
         return send
@@ -301,12 +329,25 @@ class RclpyTransport:
             profile = self._profile(reliable=kept, latched=kept)
             self._node.create_subscription(_message_class(kind), topic, arrived, profile, raw=True)
 
-    def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Callable[[bytes], None]:  # noqa: ARG002
-        """Reliable, with the last ten messages kept for slow subscribers."""
-        made = self._node.create_publisher(_message_class(kind), topic, self._profile(reliable=True, latched=latched))
+    def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Send:  # noqa: ARG002
+        """Reliable, with the last ten messages kept for slow subscribers; of a latched topic the last one."""
 
-        def send(data: bytes) -> None:
-            made.publish(data)
+        def make() -> Any:
+            return self._node.create_publisher(
+                _message_class(kind), topic, self._profile(reliable=True, latched=latched)
+            )
+
+        made: list[Any] = [make()]
+
+        def send(data: bytes | None) -> None:
+            try:
+                if data is not None:
+                    made[:] = made or [make()]
+                    made[0].publish(data)
+                elif latched and made:  # what it keeps ends with the publisher
+                    self._node.destroy_publisher(made.pop())
+            except Exception as error:  # of rclpy
+                raise DeviceLost(f"{topic}: the link takes no message: {error}") from error
 
         return send
 
@@ -338,7 +379,7 @@ class RclpyTransport:
     def _profile(self, reliable: bool, latched: bool) -> Any:
         reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
         return self._qos.QoSProfile(
-            depth=10,
+            depth=1 if latched else 10,
             reliability=reliability.RELIABLE if reliable else reliability.BEST_EFFORT,
             durability=durability.TRANSIENT_LOCAL if latched else durability.VOLATILE,
         )

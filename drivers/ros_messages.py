@@ -103,6 +103,8 @@ def pose_of(message: Any) -> tuple[FloatArray, FloatArray | None]:
     transform = as_float_array(make_transform(rotation, shift_mm))
     if covariance is None or not covariance.any():
         return transform, None
+    if not np.isfinite(covariance).all():
+        raise ValueError("a covariance that is not finite")
     order, scale = [3, 4, 5, 0, 1, 2], np.repeat([1.0, MM_PER_M], 3)
     parent = covariance[np.ix_(order, order)] * np.outer(scale, scale)
     return transform, as_float_array(right_from_parent_covariance(rotation, parent))

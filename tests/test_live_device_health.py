@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -129,3 +130,5 @@ def test_messages_left_out_are_told_with_their_number_and_not_too_often() -> Non
     assert source.left_out(2.0) == ""
     assert source.left_out(1.1 + LEFT_OUT_S).startswith("399 messages left out")
     assert source.left_out(3.0 + LEFT_OUT_S) == ""
+    silent = SimpleNamespace(name="pedal", rejected=2)  # does not say why
+    assert Source(silent, 0.0, sends=False).left_out(0.0) == "2 messages left out, the last one from pedal"

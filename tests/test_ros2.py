@@ -10,7 +10,7 @@ import threading
 import time
 import types
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -38,11 +38,13 @@ from fgreg.drivers.options import (
 from fgreg.drivers.peer_words import PeerWords
 from fgreg.drivers.ros2 import Ros2Camera, Ros2Motion, Ros2Operator, Ros2Sink, check_motion
 from fgreg.drivers.ros2_overlay import Ros2PictureSink
+from fgreg.drivers.ros2_stream import MOST_LOSSES, Topic
 from fgreg.drivers.ros2_transport import open_transport
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.session_model import StageModel
 from fgreg.model.time_sync import Stamp
 from fgreg.stage.client import Report, StageLink
+from fgreg.stage.interface import StageLost
 from fgreg.stage.limits import MotionKind, MotionLimits
 from fgreg.testing import drivers as kit
 from fgreg.testing.drivers import Bench, check_driver
@@ -292,16 +294,53 @@ def test_a_sink_publishes_metres_with_covariance_and_never_a_refused_registratio
 
 def test_a_static_transform_reaches_who_listens_later(peer: Any) -> None:
     sink = Ros2Sink(Ros2SinkOptions(static=True, **way(peer)))
-    late = open_transport(Ros2MotionOptions(**way(peer)), ros2_messages.hash_of)
+    late, latest = (open_transport(Ros2MotionOptions(**way(peer)), ros2_messages.hash_of) for _ in range(2))
     got: list[Any] = []
     try:
         sink.send(registration("ok"))
         late.subscribe("/tf_static", ros2_messages.TF, lambda data, kind, _t: got.append((data, kind)), latched=True)
         (data, kind), *_ = collect(lambda: got, 1)
         assert ros2_messages.decode(data, kind).transforms[0].transform.translation.x == 0.1
+        # Refused: who listens only now gets no transform, until there is one again.
+        sink.send(registration("refused"))
+        got.clear()
+        latest.subscribe("/tf_static", ros2_messages.TF, lambda *_: got.append("old"), latched=True)
+        time.sleep(0.2)
+        assert not got
+        sink.send(registration("ok"))
+        assert "old" in collect(lambda: got, 2)
     finally:
-        late.close()
-        sink.close()
+        for transport in (late, latest, sink):
+            transport.close()
+
+
+class Fed:
+    """A connection whose messages the test sends."""
+
+    def subscribe(self, _topic: str, _kind: str, take: Any, _latched: bool = False) -> None:
+        self.take = take
+
+    def publishers(self, _topic: str) -> int:
+        return 1
+
+
+def test_no_message_ends_a_topic_and_losses_that_wait_are_bounded() -> None:
+    fed, texts = cast("Any", Fed()), iter(range(10**6))
+
+    def read(message: Any) -> list[Any]:
+        if message.data == "bad":
+            raise KeyError("of a parser")
+        return [(stamped(ros2_peer.JointState(), 1000.0 - 10.0 * next(texts)), message.data)]
+
+    topic = Topic(fed, "/words", ros2_messages.TEXT, read, None)
+    try:
+        for word in ("bad", *["good"] * 40):
+            fed.take(ros2_messages.text(word), ros2_messages.TEXT, host_now())
+        collect(lambda: list(topic._items), 1)
+        collect(lambda: [0] * (topic.dropped == 39), 1)
+        assert (topic.rejections.count, len(topic._losses)) == (1, MOST_LOSSES)
+    finally:
+        topic.close()
 
 
 @pytest.mark.parametrize("topic", ["/fgreg/overlay", "/fgreg/overlay/compressed"])
@@ -439,6 +478,19 @@ def test_a_crtk_stage_conforms(peer: Any, probe: CrtkStage) -> None:
     assert ros2_stage.ask_stage(DriverContext(print), Ros2StageOptions(**options)).startswith("stands at ")
 
 
+def test_a_crtk_stage_that_falls_silent_is_told_to_stop(peer: Any, probe: CrtkStage) -> None:
+    stage = ros2_stage.open_stage(MODEL, namespace="/probe", **way(peer))
+    try:
+        stage.move_to(MODEL.scan_from_device(math.radians(60.0)), math.radians(8.0))
+        collect(lambda: [0] * (probe.goal > 1.0), 1)
+        probe.silent = True  # it goes on turning
+        with pytest.raises(StageLost, match="said nothing"):
+            collect(list[Any], 1, stage.status)
+    finally:
+        stage.close()  # as the watchdog does
+    collect(lambda: [0] * (probe.state == "PAUSED"), 1)
+
+
 def test_the_watchdog_stops_a_crtk_stage_whose_main_program_is_silent(peer: Any, probe: CrtkStage) -> None:
     limits = MotionLimits.of_session(MODEL, search_speed_rad_s=math.radians(10.0))
     options = {"namespace": "/probe", **way(peer)}
@@ -471,7 +523,7 @@ def test_the_watchdog_stops_a_crtk_stage_whose_main_program_is_silent(peer: Any,
 
 def rclpy_stand_in(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Any]]:
     """Modules with rclpy's documented names; what is published on a topic is taken by its raw subscribers."""
-    calls: dict[str, list[Any]] = {"published": [], "subscribed": []}
+    calls: dict[str, list[Any]] = {"published": [], "subscribed": [], "made": []}
 
     class Node:
         def create_subscription(self, kind: Any, topic: str, callback: Any, profile: Any, *, raw: bool) -> None:
@@ -482,7 +534,11 @@ def rclpy_stand_in(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[Any]]:
             assert profile.reliability == "RELIABLE"
             sent = types.SimpleNamespace()
             sent.publish = lambda data: calls["published"].append((kind.__name__, topic, data))
+            calls["made"].append(sent)
             return sent
+
+        def destroy_publisher(self, publisher: Any) -> None:
+            calls["made"].remove(publisher)
 
         def count_publishers(self, _topic: str) -> int:
             return 1
@@ -543,4 +599,16 @@ def test_the_way_by_rclpy_takes_and_gives_bytes(monkeypatch: pytest.MonkeyPatch)
     operator = Ros2Operator(Ros2OperatorOptions())
     operator.tell("hold still")
     assert calls["published"][-1] == ("String", "/fgreg/operator_told", ros2_messages.text("hold still"))
+    calls["made"][0].publish = lambda _data: 1 / 0
+    operator.tell("a link that fails does not end the session")
     operator.close()
+    transport = open_transport(Ros2OperatorOptions(), ros2_messages.hash_of)
+    send = transport.publisher("/kept", ros2_messages.TEXT, latched=True)
+    kept = calls["made"][-1]
+    send(None)
+    assert kept not in calls["made"], "a publisher keeps what it has published"
+    send(ros2_messages.text("new"))
+    calls["made"][-1].publish = lambda _data: 1 / 0
+    with pytest.raises(DeviceLost, match="/kept: the link takes no message"):
+        send(b"")
+    transport.close()

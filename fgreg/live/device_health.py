@@ -103,7 +103,8 @@ class Source:
         if new == 0 or now_s - self._told_s < LEFT_OUT_S:
             return ""
         self._left_out, self._told_s = count, now_s
-        return f"{new} message{'s' if new > 1 else ''} left out, the last one from {self._device.last_rejection}"
+        why = getattr(self._device, "last_rejection", self._device.name)
+        return f"{new} message{'s' if new > 1 else ''} left out, the last one from {why}"
 
 
 class Pictures:

@@ -176,6 +176,9 @@ class _Tried:
         name, dropped = self.device.name, self.device.dropped
         _rule(isinstance(name, str) and name, f"name is {name!r}, expected a text")
         _rule(type(dropped) is int and dropped >= 0, f"dropped is {dropped!r}, expected a number")
+        if hasattr(self.device, "rejected"):
+            last = getattr(self.device, "last_rejection", None)
+            _rule(isinstance(last, str), f"rejected without why: last_rejection is {last!r}, expected a text")
         self.run(QUIET_S, lambda: self.device.connected is connected, send=connected)
         found = self.device.connected
         _rule(found is connected, f"connected is {found!r} {when}")
