@@ -255,7 +255,7 @@ class IgtlTransformSink(IgtlDevice):
         """Send the registration; for a slow receiver only the newest is kept. Raises DeviceLost."""
         sent_s = time.time() - (host_now() - registration.stamp.host_s)
         messages = registration_messages(registration, max(sent_s, 0.0), self._names, self._version)
-        self._offers.ready = messages
+        self._offers.offer(messages)
         usable = ("TRANSFORM", self._names.registration) in messages
         if usable is not self._usable:
             self._usable, self._since_s = usable, host_now()

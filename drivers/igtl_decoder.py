@@ -28,6 +28,7 @@ from fgreg.drivers.igtl_messages import (
     parse_header,
 )
 from fgreg.drivers.stream_decoder import Decoder, Rejections
+from fgreg.drivers.tcp_link import KEPT_S
 
 POSE_TYPES = ("TRANSFORM", "POSITION", "TDATA", "QTDATA")
 """Types with poses: who wants a device's TRANSFORM takes its pose from any of them."""
@@ -51,12 +52,16 @@ class Offers:
     """What a peer may ask for.
 
     Attributes:
-        devices: by type. ready: the newest message of each. why: there is none of the others.
+        devices: by type. why: there is none of those that are not ready.
     """
 
     devices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    ready: Mapping[tuple[str, str], bytes] = field(default_factory=dict)
     why: str = "there is none yet"
+    _ready: tuple[float, Mapping[tuple[str, str], bytes]] = field(default=(0.0, {}))
+
+    def offer(self, messages: Mapping[tuple[str, str], bytes]) -> None:
+        """The newest message of each type and device; for KEPT_S, and in place of all before."""
+        self._ready = time.monotonic(), messages
 
     def answer(self, header: Header) -> bytes:
         """The answer to a query or request."""
@@ -73,8 +78,9 @@ class Offers:
         if operation != "GET":
             started = operation == "STT" and bool(devices)
             return pack_raw(f"RTS_{kind}"[:TYPE_BYTES], header.device, bytes([not started]), now, version=version)
-        for device in named:
-            if (message := self.ready.get((kind, device))) is not None:
+        since_s, ready = self._ready
+        for device in named if time.monotonic() - since_s <= KEPT_S else ():
+            if (message := ready.get((kind, device))) is not None:
                 return message
         if not devices:
             status = Status(STATUS_UNKNOWN, 0, "UNKNOWN", f"{header.kind} is not served here")

@@ -34,15 +34,17 @@ class IgtlPictureSink(IgtlDevice):
 
     def __init__(self, endpoint: Endpoint, device: str = "Overlay", header_version: int = 2) -> None:
         self._device, self._version = check_name(device), check_version(header_version)
-        self._offers = Offers({"IMAGE": (device,)}, why="there is no picture yet")
+        self._offers = Offers({"IMAGE": (device,)}, why="there is no new picture")
         super().__init__(endpoint, offers=self._offers)
 
     def send(self, picture: OverlayPicture) -> None:
         """Send a picture. Raises DeviceLost."""
         sent_s = max(time.time() - (host_now() - picture.stamp.host_s), 0.0)
         message = pack_image(self._device, cv2.cvtColor(picture.image, cv2.COLOR_BGR2RGB)[None], sent_s, self._version)
-        self._offers.ready = {("IMAGE", self._device): message}
-        self._link.offer(message)
+        self._offers.offer({("IMAGE", self._device): message})
+        self._link.offer(
+            message, latest=b""
+        )  # a later receiver waits for the next: this one's lines may be refused then
         self._raise_loss()
 
 

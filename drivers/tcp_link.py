@@ -38,6 +38,8 @@ MESSAGE_S = 5.0
 """Time after its first byte within which a message has to be complete, or a block taken."""
 STAYED_S = 1.0
 """After a loss a peer that may be silent counts as there once it has stayed for this long."""
+KEPT_S = 2.0
+"""A block that was offered longer ago is not given to a later peer, nor to one that asks: its source has stopped."""
 MAX_PEERS = 8
 MAX_REPLIES = 16
 """Largest number of replies that wait for one peer; the rest is left out."""
@@ -100,7 +102,7 @@ class TcpLink(Generic[Item]):
             is the peer's name.
         greeting: sent to every new peer first.
         farewell: sent on close, as far as the peer takes it at once.
-        keep_latest: the link only sends: a new peer gets the block that was offered last.
+        keep_latest: the link only sends: a new peer gets the block that was offered last, unless that is KEPT_S ago.
         silent_s: a peer that sends no message for this long counts as lost; None if it may be silent.
 
     Raises:
@@ -126,6 +128,7 @@ class TcpLink(Generic[Item]):
         self._bytes = 0
         self._dropped = 0
         self._latest: bytes | None = None
+        self._latest_s = 0.0
         self._offered: bytes | None = None
         self._losses: deque[str] = deque(maxlen=MAX_PEERS)
         self._there = False
@@ -178,7 +181,7 @@ class TcpLink(Generic[Item]):
         with self._lock:
             self._offered = block
             if self._keep_latest:
-                self._latest = block if latest is None else latest
+                self._latest, self._latest_s = block if latest is None else latest, time.monotonic()
         self._wake_up()
 
     def close(self) -> None:
@@ -283,7 +286,8 @@ class TcpLink(Generic[Item]):
             ):  # else old blocks wait in the system's buffer
                 peer.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, CHUNK_BYTES)
         with self._lock:
-            latest = self._latest if self._offered is None else None  # else it is about to be sent to all
+            fresh = self._offered is None and time.monotonic() - self._latest_s <= KEPT_S
+            latest = self._latest if fresh else None  # what is offered now is about to be sent to all
         peer.since_s = peer.heard_s = time.monotonic()
         if not self._gone:
             self._is_there(peer)

@@ -338,7 +338,9 @@ def test_a_warning_is_usable_and_says_so(
 
 
 def test_queries_are_answered_with_the_registration_or_why_not(
-    sink_and_receiver: tuple[IgtlTransformSink, Callable[[int], list[Told]]], asker: socket.socket
+    sink_and_receiver: tuple[IgtlTransformSink, Callable[[int], list[Told]]],
+    asker: socket.socket,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sink, receive = sink_and_receiver
 
@@ -362,6 +364,10 @@ def test_queries_are_answered_with_the_registration_or_why_not(
     np.testing.assert_allclose(read_matrix(registration.content), MATRIX, atol=1e-5)
     assert (plane.device, status.device, code(status)) == ("PlaneToTrus", "RegistrationStatus", 1)
     assert (code(unknown), code(unread)) == (4, 12)
+    with monkeypatch.context() as context:  # who sends the registration has stopped: it is no answer any more
+        context.setattr("fgreg.drivers.igtl_decoder.KEPT_S", -1.0)
+        ask("GET_TRANS")
+        assert code(*receive(1)) == 13
     ask("STT_TRANS")
     ask("STT_TDATA", "Tool")
     ask("GET_CAPABIL")

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from fgreg.cli.live_display import status_line
 from fgreg.drivers.base import CommandKind, MotionSample, OperatorCommand, PaFrame, Registration, StereoFrame, host_now
 from fgreg.errors import EventRefused, FgregError, JournalError
 from fgreg.geometry.transforms import FloatArray, make_transform
-from fgreg.live.loop import LiveLoop
+from fgreg.live.loop import SEND_S, LiveLoop
 from fgreg.live.marker_tracker import MarkerTracker
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
@@ -246,6 +247,18 @@ def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:
         assert registration.trus_T_camera is None
         assert registration.scan_rad is None
         assert "moving" in registration.reasons[0]
+
+
+def test_who_got_a_registration_hears_that_there_is_none_any_more(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert stand.sink.sent[-1].verdict != "refused"
+    monkeypatch.setattr(Recorder, "state", replace(stand.recorder.state, estimate=None))
+    stand.loop.marker_tracker.poses.clear()  # as after a move, with the marker out of view
+    time.sleep(SEND_S)
+    stand.loop.turn()
+    last = stand.sink.sent[-1]
+    assert (last.verdict, last.trus_T_camera, last.reasons) == ("refused", None, ("there is no registration",))
 
 
 def test_a_move_that_the_operator_reports_invalidates_until_it_is_in_the_estimate(

@@ -115,6 +115,22 @@ def test_a_bump_is_noticed_within_two_frames_and_measured_once_the_camera_rests(
     assert pictures.frames(30) is None, "the new epoch has a reference of its own"
 
 
+def test_a_frame_from_before_a_reported_move_is_no_reference_of_the_new_epoch(
+    pictures: Pictures, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures.frames(20)
+    under_way: Future[Any] = Future()
+    with monkeypatch.context() as context:
+        context.setattr(Pictures, "run", lambda *_: under_way)
+        pictures.frames(1)
+    before = pictures.seen(None)
+    pictures.tags.begin_again()
+    pictures.bump()
+    under_way.set_result(before)
+    assert pictures.frames(20) is None
+    assert pictures.tags.moving_since_s is None
+
+
 def test_a_camera_that_comes_back_has_not_moved(pictures: Pictures) -> None:
     pictures.frames(20)
     pictures.bump()

@@ -43,11 +43,12 @@ class Screen:
     connected: bool = True
     dropped: int = 0
     fails: bool = False
+    raises: Exception = field(default_factory=lambda: DeviceLost("unplugged"))
     shown: list[OverlayPicture] = field(default_factory=list)
 
     def send(self, picture: OverlayPicture) -> None:
         if self.fails:
-            raise DeviceLost("unplugged")
+            raise self.raises
         self.shown.append(picture)
 
     def close(self) -> None:
@@ -169,6 +170,13 @@ def test_each_frame_is_shown_once_and_an_old_one_again_without_lines(room: RoomS
         wait_for(lambda: not screen.shown[2:] and feed._losses)
         assert feed.losses() == [(0, "unplugged")]
         assert feed.losses() == []
+        screen.raises = RuntimeError("of a library")
+        feed.show(room.at(now, replace(room.frame, index=2)))
+        wait_for(lambda: feed._losses)
+        assert "RuntimeError: of a library" in feed.losses()[0][1]
+        screen.fails = False
+        feed.show(room.at(now, replace(room.frame, index=3)))
+        wait_for(lambda: screen.shown[2:])
     finally:
         feed.close()
 
@@ -189,6 +197,9 @@ def test_a_receiver_gets_the_picture_with_the_time_of_its_exposure(room: RoomSta
                 pixels = np.frombuffer(told.content[72:], np.uint8).reshape(4, 6, 3)
                 np.testing.assert_array_equal(pixels, image[..., ::-1])  # RGB
                 peer.sendall(message("GET_IMAGE", "", b""))
+            with socket.create_connection(("127.0.0.1", sink.endpoint.port), timeout=5.0) as late:
+                late.sendall(message("GET_CAPABIL", "", b""))
+                assert read_message(late.recv(1 << 16)).kind == "CAPABILITY"  # and no picture, which may be refused now
         with pytest.raises(DeviceLost, match=r"overlay: 127\.0\.0\.1:\d+: "):
             wait_for(lambda: sink.send(OverlayPicture(room.frame.stamp, image, 1)))
     finally:

@@ -288,7 +288,7 @@ def test_a_question_is_answered_to_who_asked_while_it_goes_on_sending(server: Tc
         wait_for(lambda: server.rejections.count == 40 - tcp_link.MAX_REPLIES)
 
 
-def test_a_late_receiver_gets_what_was_offered_last() -> None:
+def test_a_late_receiver_gets_what_was_offered_last_unless_that_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
     link = TcpLink(Endpoint.listening(0), Lines, greeting=b"hello ", keep_latest=True)
     try:
         link.offer(b"old")
@@ -298,6 +298,11 @@ def test_a_late_receiver_gets_what_was_offered_last() -> None:
             while len(heard) < 9 and (more := peer.recv(100)):
                 heard += more
             assert heard == b"hello new"
+        monkeypatch.setattr(tcp_link, "KEPT_S", -1.0)
+        with connect(link) as peer:
+            assert peer.recv(100) == b"hello "
+            link.close()
+            assert peer.recv(100) == b""
     finally:
         link.close()
 

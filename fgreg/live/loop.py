@@ -142,6 +142,7 @@ class LiveLoop:
         self._bmode: BmodeFrame | None = None
         self._unshown = 0
         self._sent_s, self._stepped_s = -math.inf, -math.inf
+        self._sent = False  # whether the sinks have got anything
         self._snapshot: Snapshot | None = None
         self._tracking: TrackEstimate | None = None
 
@@ -445,22 +446,28 @@ class LiveLoop:
         self._sent_s = now
         estimate, newest = self._recorder.state.estimate, self.marker_tracker.poses.newest()
         stamp = None if self.marker_tracker.newest is None else self.marker_tracker.newest.stamp
-        if estimate is None or stamp is None or newest is None:
+        begins = not self._sent and (estimate is None or newest is None)
+        if stamp is None or begins:  # whoever has got a registration has to hear that there is none any more
             return
+        self._sent = True
         invalid = self._invalid()
-        refused = estimate.verdict is Verdict.REFUSED or bool(invalid)
-        tracking = None if refused else self._tracking
-        stage_rad = None if tracking is None else tracking.stage_rad
-        registration = Registration(
-            stamp,
-            (Verdict.REFUSED if refused else estimate.verdict).value,
-            None if refused else estimate.trus_T_camera,
-            None if refused else estimate.covariance,
-            None if stage_rad is None else self._model.stage.scan_from_device(stage_rad),
-            None if tracking is None else tracking.sigma_rad,
-            (invalid,) if invalid else estimate.reasons,
-            stage_rad,
-        )
+        if estimate is None or estimate.verdict is Verdict.REFUSED or invalid:
+            reasons = ("there is no registration",) if estimate is None else estimate.reasons
+            refused = (invalid,) if invalid else reasons
+            registration = Registration(stamp, Verdict.REFUSED.value, None, None, reasons=refused)
+        else:
+            tracking, stage = self._tracking, self._model.stage
+            stage_rad = None if tracking is None else tracking.stage_rad
+            registration = Registration(
+                stamp,
+                estimate.verdict.value,
+                estimate.trus_T_camera,
+                estimate.covariance,
+                None if stage_rad is None else stage.scan_from_device(stage_rad),
+                None if tracking is None else tracking.sigma_rad,
+                estimate.reasons,
+                stage_rad,
+            )
         for number, sink in enumerate(self._devices.sinks):
             try:
                 sink.send(registration)

@@ -17,7 +17,7 @@ import numpy as np
 from fgreg.detection.frame_files import to_display
 from fgreg.drivers.base import OverlayPicture, PictureSink
 from fgreg.drivers.overlay_picture import OverlayState, overlay_picture
-from fgreg.errors import FgregError
+from fgreg.errors import FgregError, one_line
 from fgreg.geometry.transforms import FloatArray, transform_points
 from fgreg.live.recorder import Recorded
 from fgreg.live.status import Status
@@ -139,6 +139,8 @@ class OverlayFeed:
                 self._sinks[n].send(OverlayPicture(frame.stamp, image, frame.index))
             except FgregError as error:
                 self._losses.append((n, str(error)))
+            except Exception as error:  # the thread has to go on, else an old picture looks like a present one
+                self._losses.append((n, one_line(f"a picture cannot be shown: {type(error).__name__}: {error}", 200)))
 
     def state(self, status: Status) -> OverlayState:
         """What there is to draw."""

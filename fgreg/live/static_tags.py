@@ -80,7 +80,8 @@ class StaticTags:
         self._monitor = TagMonitor()
         self._job: _Job | None = None
         self._board_s = -np.inf
-        self._newest: WholeFrame | None = None
+        self._newest: WholeFrame | None = None  # searched for tags
+        self._given: WholeFrame | None = None  # the last one that came
         self._alarm_s = 0.0
         self._alarms: deque[float] = deque(maxlen=MOST_ALARMS + 1)
         self._apart: Counter[int] = Counter()
@@ -101,8 +102,9 @@ class StaticTags:
         return news
 
     def begin_again(self) -> None:
-        """The camera has moved, as others tell: where the tags are is learnt again."""
+        """The camera has moved, as others tell: where the tags are is learnt again, from the frames to come."""
         self._monitor, self.moving_since_s = TagMonitor(), None
+        self._job, self._newest = None, self._given
         self._apart.clear()
         self._disagree = 0
 
@@ -111,6 +113,7 @@ class StaticTags:
 
         ``with_board``: whether the board lies still now, which it does not while the laser is aimed at it.
         """
+        self._given = self._given if whole is None else whole
         move = self._take(now_s)
         if self.moving_since_s is not None and now_s - self._alarm_s > UNREST_S:
             move = HolderMove(self.moving_since_s, None, None)
