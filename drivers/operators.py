@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from fgreg.drivers.options import IgtlOperatorOptions
 
 
-PIECE_BYTES = 2048
-"""Bytes that are decoded before their words are handed over."""
+CHUNK_BYTES = 2048
+"""Bytes of a peer's words that are taken in before another's turn: a stop does not wait for a burst of others."""
 
 
 class _WordDecoder(MessageDecoder):
@@ -43,12 +43,9 @@ class _WordDecoder(MessageDecoder):
 
     def feed(self, data: bytes, host_s: float) -> list[Message]:
         """As of the base. Raises StreamBroken."""
-        messages = []
-        for begin in range(0, len(data), PIECE_BYTES):  # a stop does not wait for the rest of a burst
-            found = super().feed(data[begin : begin + PIECE_BYTES], host_s)
-            for message in found:
-                self._take(message)
-            messages += found
+        messages = super().feed(data, host_s)
+        for message in messages:
+            self._take(message)
         return messages
 
 
@@ -82,7 +79,7 @@ class IgtlOperator(LinkedDevice[Message]):
         def decoder(rejections: Rejections) -> _WordDecoder:
             return _WordDecoder(rejections, wanted, counts, self._take)
 
-        super().__init__(TcpLink(endpoint, decoder))
+        super().__init__(TcpLink(endpoint, decoder, chunk_bytes=CHUNK_BYTES))
 
     @property
     def dropped(self) -> int:

@@ -104,6 +104,7 @@ class TcpLink(Generic[Item]):
         farewell: sent on close, as far as the peer takes it at once.
         keep_latest: the link only sends: a new peer gets the block that was offered last, unless that is KEPT_S ago.
         silent_s: a peer that sends no message for this long counts as lost; None if it may be silent.
+        chunk_bytes: read of a peer before the next one's turn.
 
     Raises:
         InputError: listening at this address is not possible.
@@ -118,7 +119,9 @@ class TcpLink(Generic[Item]):
         farewell: bytes = b"",
         keep_latest: bool = False,
         silent_s: float | None = None,
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
+        self._chunk_bytes = chunk_bytes
         self._decoder, self._greeting, self._farewell = decoder, greeting, farewell
         self._keep_latest, self._silent_s = keep_latest, silent_s
         self._endpoint = endpoint
@@ -320,7 +323,7 @@ class TcpLink(Generic[Item]):
 
     def _read(self, peer: _Peer[Item]) -> None:
         try:
-            data = peer.socket.recv(CHUNK_BYTES)
+            data = peer.socket.recv(self._chunk_bytes)
         except BlockingIOError:
             return
         if not data:

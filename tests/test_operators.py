@@ -8,6 +8,7 @@ import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -318,6 +319,27 @@ def test_a_peer_gets_messages_and_replies(switch: tuple[IgtlOperator, socket.soc
     wait_for(lambda: operator.poll() or operator.rejected)
     assert "'go' is not understood" in received(peer)
     assert operator.rejected == 1
+
+
+def test_a_stop_does_not_wait_for_the_words_of_another_peer(
+    switch: tuple[IgtlOperator, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operator, peer = switch
+    taken, both_sent = list[str](), threading.Event()
+
+    def take(_words: PeerWords, line: str, *_: object) -> str:
+        both_sent.wait(5.0)
+        taken.append(line)
+        return "no"
+
+    monkeypatch.setattr(PeerWords, "take", take)
+    with socket.create_connection(("127.0.0.1", operator.endpoint.port), timeout=5.0) as other:
+        other.sendall(words("go") * 500)
+        peer.sendall(words("stop"))
+        time.sleep(0.05)
+        both_sent.set()
+        wait_for(lambda: len(taken) == 501)
+    assert taken.index("stop") < 100
 
 
 def test_several_operators_are_one_and_a_loss_delays_no_stop(
