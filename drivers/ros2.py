@@ -54,6 +54,8 @@ if TYPE_CHECKING:
         Ros2SinkOptions,
     )
 
+WORDS = 4096
+"""Words that the link holds, at most: none of a burst may push out a stop."""
 QUEUE = 8
 """Pictures of one camera that wait, at most."""
 
@@ -214,7 +216,7 @@ class Ros2Operator(_Ros2Source):
         transport = open_transport(options, ros.hash_of)
         self._peer, self._words, self._queue = options.topic, words or PeerWords(), WordQueue()
         self._send = transport.publisher(options.answers, ros.TEXT)
-        topic = Topic(transport, options.topic, ros.TEXT, _each(self._heard), None, at_once=True)
+        topic = Topic(transport, options.topic, ros.TEXT, _each(self._heard), None, WORDS, at_once=True)
         super().__init__(transport, topic)
 
     @property

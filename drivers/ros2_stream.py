@@ -39,7 +39,8 @@ class Topic:
         read: what a message holds: items, each with a message that has its header. Raises ValueError for a message
             that cannot be used.
         silent_s: without a message for this long it counts as lost; None: only once all of its publishers are gone.
-        room: messages that wait to be decoded, and items that wait to be fetched, at most; the newest are kept.
+        room: messages that the link holds, or that wait to be decoded, and items that wait to be fetched, at most; the
+            newest are kept.
         delay_s: from the event to the message's stamp; subtracted.
         latched: whether the topic keeps its last message for later subscribers.
         at_once: read in the link's thread, so that no message waits for another; for small messages.
@@ -72,7 +73,7 @@ class Topic:
         self._thread = threading.Thread(target=self._run, name=f"ROS 2 {topic}", daemon=True)
         prepare(kind)
         self._thread.start()
-        transport.subscribe(topic, kind, self._take, latched)
+        transport.subscribe(topic, kind, self._take, latched, room)
 
     @property
     def connected(self) -> bool:

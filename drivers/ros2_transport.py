@@ -34,6 +34,7 @@ Take = Callable[[bytes, str, float], None]
 Send = Callable[[bytes | None], None]
 """Sends a message and never waits; None withdraws the one that a latched topic keeps. Raises DeviceLost where the link
 does not take it."""
+DEPTH = 10
 NODE = "fgreg"
 RETRY_MS = 200
 """Between attempts to reach the router."""
@@ -44,8 +45,15 @@ NO_HASH = "TypeHashNotSupported"
 class Transport(Protocol):
     """A connection to ROS 2."""
 
-    def subscribe(self, topic: str, kind: str, take: Take, latched: bool = False) -> None:
-        """Call ``take`` with each message; ``latched``: also with the last one before now, if the topic keeps it."""
+    def subscribe(self, topic: str, kind: str, take: Take, latched: bool = False, depth: int = DEPTH) -> None:
+        """Call ``take`` with each message.
+
+        Args:
+            topic, kind: what is subscribed to.
+            take: see ``Take``.
+            latched: also with the last message before now, if the topic keeps it.
+            depth: messages that the link holds until they are taken, at least; the oldest go first.
+        """
 
     def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Send:
         """A function that sends messages. Later subscribers get the last one of a latched topic."""
@@ -136,7 +144,7 @@ class ZenohTransport:
         self._thread = threading.Thread(target=self._open, args=(config,), name="zenoh", daemon=True)
         self._thread.start()
 
-    def subscribe(self, topic: str, kind: str, take: Take, latched: bool = False) -> None:
+    def subscribe(self, topic: str, kind: str, take: Take, latched: bool = False, depth: int = DEPTH) -> None:  # noqa: ARG002
         """Of any type: a message of another one is told to the receiver with its type."""
 
         def arrived(sample: Any) -> None:
@@ -319,23 +327,22 @@ class RclpyTransport:
         self._thread = threading.Thread(target=self._spin, name="rclpy", daemon=True)
         self._thread.start()
 
-    def subscribe(self, topic: str, kind: str, take: Take, latched: bool = False) -> None:
+    def subscribe(self, topic: str, kind: str, take: Take, latched: bool = False, depth: int = DEPTH) -> None:
         """Best effort, which fits every publisher. Transient local fits only its like: there are both, then."""
 
         def arrived(data: bytes) -> None:
             take(bytes(data), kind, host_now())
 
         for kept in (False, True) if latched else (False,):
-            profile = self._profile(reliable=kept, latched=kept)
+            profile = self._profile(reliable=kept, latched=kept, depth=depth)
             self._node.create_subscription(_message_class(kind), topic, arrived, profile, raw=True)
 
     def publisher(self, topic: str, kind: str, latched: bool = False, urgent: bool = False) -> Send:  # noqa: ARG002
         """Reliable, with the last ten messages kept for slow subscribers; of a latched topic the last one."""
 
         def make() -> Any:
-            return self._node.create_publisher(
-                _message_class(kind), topic, self._profile(reliable=True, latched=latched)
-            )
+            profile = self._profile(reliable=True, latched=latched, depth=1 if latched else DEPTH)
+            return self._node.create_publisher(_message_class(kind), topic, profile)
 
         made: list[Any] = [make()]
 
@@ -376,10 +383,10 @@ class RclpyTransport:
             except Exception:  # of rclpy while it ends; of one message otherwise
                 time.sleep(0.01)
 
-    def _profile(self, reliable: bool, latched: bool) -> Any:
+    def _profile(self, reliable: bool, latched: bool, depth: int) -> Any:
         reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
         return self._qos.QoSProfile(
-            depth=1 if latched else 10,
+            depth=depth,
             reliability=reliability.RELIABLE if reliable else reliability.BEST_EFFORT,
             durability=durability.TRANSIENT_LOCAL if latched else durability.VOLATILE,
         )

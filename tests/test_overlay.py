@@ -147,6 +147,18 @@ def test_a_picture_of_another_size_than_calibrated_shows_no_lines(room: RoomStat
     assert (picture[40:] == 90).all()
 
 
+def test_a_pm_left_out_by_hand_is_a_cross(room: RoomStatus, screen: Screen) -> None:
+    feed = room.fed([screen])
+    try:
+        now = host_now()
+        both = feed.state(room.at(now)).seen
+        status = room.at(now, recorder=replace(room.at(now).recorder, excluded=frozenset({1})))
+        seen = feed.state(status).seen
+        assert (len(seen.pms), len(seen.unused)) == (len(both.pms) - 1, len(both.unused) + 1)
+    finally:
+        feed.close()
+
+
 @pytest.fixture
 def screen() -> Screen:
     return Screen()

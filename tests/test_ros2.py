@@ -36,7 +36,7 @@ from fgreg.drivers.options import (
     Ros2StageOptions,
 )
 from fgreg.drivers.peer_words import PeerWords
-from fgreg.drivers.ros2 import Ros2Camera, Ros2Motion, Ros2Operator, Ros2Sink, check_motion
+from fgreg.drivers.ros2 import WORDS, Ros2Camera, Ros2Motion, Ros2Operator, Ros2Sink, check_motion
 from fgreg.drivers.ros2_overlay import Ros2PictureSink
 from fgreg.drivers.ros2_stream import MOST_LOSSES, Topic
 from fgreg.drivers.ros2_transport import open_transport
@@ -317,7 +317,7 @@ def test_a_static_transform_reaches_who_listens_later(peer: Any) -> None:
 class Fed:
     """A connection whose messages the test sends."""
 
-    def subscribe(self, _topic: str, _kind: str, take: Any, _latched: bool = False) -> None:
+    def subscribe(self, _topic: str, _kind: str, take: Any, _latched: bool, _depth: int) -> None:
         self.take = take
 
     def publishers(self, _topic: str) -> int:
@@ -597,6 +597,7 @@ def test_the_way_by_rclpy_takes_and_gives_bytes(monkeypatch: pytest.MonkeyPatch)
     motion.close()
     assert calls["published"] == ["destroyed"]
     operator = Ros2Operator(Ros2OperatorOptions())
+    assert calls["subscribed"][-1][3].depth == WORDS, "words after a stop would push it out"
     operator.tell("hold still")
     assert calls["published"][-1] == ("String", "/fgreg/operator_told", ros2_messages.text("hold still"))
     calls["made"][0].publish = lambda _data: 1 / 0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 import numpy as np
 
@@ -153,7 +153,7 @@ class OverlayFeed:
         goal = None if tracking is None else tracking.stage_rad
         homed = status.plane is not None and status.plane.homed
         scan = status.plane.scan_rad if status.plane is not None and homed else None
-        pms, unused = self._pm_places(estimate)
+        pms, unused = self._pm_places(estimate, status.recorder.excluded)
         goal_scan = None if goal is None else model.stage.scan_from_device(goal)
         seen = Seen(self._plane(scan), self._beam(status, estimate), pms, unused, self._plane(goal_scan))
         return OverlayState(
@@ -182,15 +182,18 @@ class OverlayFeed:
         trus_T_laser = estimate.trus_T_camera @ pose.parent_T_child @ laser
         return transform_points(trus_T_laser, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, tracking.lambda_mm]]))
 
-    def _pm_places(self, estimate: OnlineEstimate) -> tuple[FloatArray, FloatArray]:
-        """The PMs that are used (n, 3) and those that are not (m, 3)."""
+    def _pm_places(self, estimate: OnlineEstimate, excluded: Set[int]) -> tuple[FloatArray, FloatArray]:
+        """The PMs that are used (n, 3) and those that are not (m, 3), or left out by hand."""
         with self._lock:
-            pms, laser, placed = list(self._pms.values()), self._marker_T_laser, self._placed is estimate
+            pms, laser, placed = list(self._pms.items()), self._marker_T_laser, self._placed is estimate
             self._placed = estimate
         if not placed and laser is not None:
-            for pm in pms:
+            for _, pm in pms:
                 pm.place(estimate, laser, self._model)
-        sides = [[pm.trus_p for pm in pms if pm.used is used and pm.trus_p is not None] for used in (True, False)]
+        sides: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+        for number, pm in pms:
+            if pm.trus_p is not None:
+                sides[not pm.used or number in excluded].append(pm.trus_p)
         return np.reshape(np.array(sides[0]), (-1, 3)), np.reshape(np.array(sides[1]), (-1, 3))
 
 
