@@ -231,12 +231,21 @@ def test_a_move_that_tags_and_arm_show_is_one_move_as_the_tags_measured_it(stand
     assert tags.begun_again == 0, "the tags' new poses are the reference of the new epoch"
 
 
-def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:
+def test_what_is_sent_without_an_estimate_or_meanwhile_is_refused(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert stand.sink.sent
     last, stage = stand.sink.sent[-1], stand.session.journal.model.stage
     assert last.trus_T_camera is not None
     if last.scan_rad is not None:
         assert last.stage_rad == pytest.approx(stage.device_from_scan(last.scan_rad))
+    with monkeypatch.context() as context:
+        context.setattr(Recorder, "state", replace(stand.recorder.state, estimate=None))
+        stand.loop.marker_tracker.poses.clear()  # as after a move, with the marker out of view
+        time.sleep(SEND_S)
+        stand.loop.turn()
+    last = stand.sink.sent[-1]
+    assert (last.verdict, last.trus_T_camera, last.reasons) == ("refused", None, ("there is no registration",))
     stand.base_T_camera = MOVED
     stand.turn(0.1)
     sent = len(stand.sink.sent)
@@ -247,18 +256,6 @@ def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:
         assert registration.trus_T_camera is None
         assert registration.scan_rad is None
         assert "moving" in registration.reasons[0]
-
-
-def test_who_got_a_registration_hears_that_there_is_none_any_more(
-    stand: Stand, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert stand.sink.sent[-1].verdict != "refused"
-    monkeypatch.setattr(Recorder, "state", replace(stand.recorder.state, estimate=None))
-    stand.loop.marker_tracker.poses.clear()  # as after a move, with the marker out of view
-    time.sleep(SEND_S)
-    stand.loop.turn()
-    last = stand.sink.sent[-1]
-    assert (last.verdict, last.trus_T_camera, last.reasons) == ("refused", None, ("there is no registration",))
 
 
 def test_a_move_that_the_operator_reports_invalidates_until_it_is_in_the_estimate(
