@@ -225,6 +225,10 @@ def solve(
     without_aim: Annotated[
         str | None, typer.Option("--without-aim", metavar="N,N", help="Leave out these aims, counted from 0.")
     ] = None,
+    certify: Annotated[
+        bool,
+        typer.Option("--certify", help="Prove that no other registration explains the pairs (up to some seconds)."),
+    ] = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -236,7 +240,7 @@ def solve(
     from fgreg.model.estimate import Verdict
     from fgreg.pipeline.solve import SolveRequest, solve_session
 
-    config = solve_config(limit_mm, estimate)
+    config = solve_config(limit_mm, estimate, certify=certify)
     without = shot_names(without_pm, without_aim, ("--without-pm", "--without-aim"))
     warn_of_leftovers(session, out, rrd)
     with _progress(quiet or as_json) as progress:

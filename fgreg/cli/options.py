@@ -49,6 +49,10 @@ OnlineEstimateOption = Annotated[
 ]
 
 
+CERTIFICATE_BUDGET = 3_000_000
+"""Of ``--certify``: some seconds at most."""
+
+
 def processes(jobs: int | None) -> int:
     """Number of processes: that of ``--jobs``, or the cores that this process may use.
 
@@ -61,7 +65,11 @@ def processes(jobs: int | None) -> int:
 
 
 def solve_config(
-    limit_mm: float, estimate: str, known: tuple[str, ...] = ("sound_speed", "probe_radius")
+    limit_mm: float,
+    estimate: str,
+    known: tuple[str, ...] = ("sound_speed", "probe_radius"),
+    *,
+    certify: bool = False,
 ) -> "SolveConfig":
     """The settings from the options; ``known``: extra variables that this command can estimate.
 
@@ -76,7 +84,10 @@ def solve_config(
         raise InputError("--estimate", estimate, expected)
     try:
         return SolveConfig(
-            limit_mm=limit_mm, estimate_sound_speed="sound_speed" in wanted, estimate_radius="probe_radius" in wanted
+            limit_mm=limit_mm,
+            estimate_sound_speed="sound_speed" in wanted,
+            estimate_radius="probe_radius" in wanted,
+            certificate_budget=CERTIFICATE_BUDGET if certify else 0,
         )
     except ValueError as error:
         raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error

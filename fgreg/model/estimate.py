@@ -113,6 +113,32 @@ class SystematicEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CertificateEstimate:
+    """What is proved of a registration, with beam, rig's constants and inliers as estimated. None: not known."""
+
+    proved: Annotated[bool, Key("no other registration explains the pairs within `within_chi2` of its chi square")]
+    gap: Annotated[
+        float | None, Key("by which part the chi square of the pairs may still be lower", _NOT_NEGATIVE, null=True)
+    ]
+    within_chi2: Annotated[float | None, Key("for what follows", _NOT_NEGATIVE, null=True)]
+    within_rad: Annotated[
+        float | None,
+        Key(
+            "all that do are turned by at most this from it",
+            Number(0.0, ANY_SIZE.high, degrees=True, decimals=6),
+            null=True,
+        ),
+    ]
+    within_mm: Annotated[
+        float | None, Key("and move the middle of the pairs by at most this", _NOT_NEGATIVE, null=True)
+    ]
+    other_trus_T_camera: Annotated[
+        FloatArray | None, Key("another minimum, which refuses it", _TRANSFORM, brief=True)
+    ] = None
+    reason: Annotated[str, Key("why it is not proved", brief=True)] = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class EpochEstimate:
     """One camera epoch: registration (None where none can be computed), covariance (6, 6) over the right tangent."""
 
@@ -136,6 +162,9 @@ class EpochEstimate:
             brief=True,
         ),
     ] = ()
+    certificate: Annotated[
+        CertificateEstimate | None, Key("what is proved of it, where that was asked for", brief=True)
+    ] = None
 
 
 _USED, _UNUSED = ("used", True), ("used", False)

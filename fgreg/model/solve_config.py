@@ -29,6 +29,8 @@ class SolveConfig:
         posterior_samples: largest number of draws; sampling then stops with fewer effective samples.
         posterior_looks: with more looks than this the posterior is taken as the Gaussian at the optimum.
         seed: of those draws.
+        certificate_budget: work at most for a proof that no other registration explains the pairs, as cells of
+            rotations times PMs (about 3 us each); 0: no proof.
     """
 
     limit_mm: Annotated[
@@ -55,12 +57,15 @@ class SolveConfig:
     posterior_samples: int = 4500
     posterior_looks: int = 80
     seed: int = 1
+    certificate_budget: int = 0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.limit_mm) and self.limit_mm > 0):
             raise ValueError(f"limit_mm is {self.limit_mm}, expected a number > 0")
         if self.posterior_samples < 100:
             raise ValueError(f"posterior_samples is {self.posterior_samples}, expected at least 100")
+        if self.certificate_budget < 0:
+            raise ValueError(f"certificate_budget is {self.certificate_budget}, expected at least 0")
         for name in ("amplitude_sigma", "sound_speed_sigma", "radius_sigma_mm", "posterior_effective"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

@@ -50,6 +50,7 @@ from fgreg.registration.posterior_mean import (
     estimated_sound_speed,
     posterior_mean,
 )
+from fgreg.registration.proof import Proof, prove
 from fgreg.registration.readout import read_aims, read_laser, read_pairs
 from fgreg.registration.register import Registration, register, too_few_text
 from fgreg.registration.verdict import (
@@ -187,7 +188,11 @@ def solve(
         *(() if pictures else budget.conditions),
     ]
     steady = {k: _steadiness(registration, place, config.limit_mm) for place, k in enumerate(registration.epochs)}
+    proofs = {k: proof for k in registration.epochs if (proof := prove(registration, k, config)) is not None}
+    for k, proof in proofs.items():
+        steady[k].extend(proof.conditions)
     reports = _epoch_verdicts(measurements, centred, posterior, budget, pairs, model, config, common, steady, before)
+    reports = tuple(_with_proof(report, proofs.get(report.estimate.index)) for report in reports)
     epochs, several = tuple(report.estimate for report in reports), len(reports) > 1
     found = [(c, f"epoch {k}: {c.text}" if several else c.text) for k, of in enumerate(reports) for c in of.conditions]
     reports = (*reports[:-1], replace(reports[-1], conditions=(*common, *reports[-1].conditions)))
@@ -212,6 +217,10 @@ def solve(
         snapshot=snapshot,
         reports=reports,
     )
+
+
+def _with_proof(report: EpochReport, proof: Proof | None) -> EpochReport:
+    return report if proof is None else replace(report, estimate=replace(report.estimate, certificate=proof.estimate))
 
 
 def _no_solution(measurements: Measurements, tracks: Sequence[Track], conditions: Sequence[Condition]) -> Solution:

@@ -1,0 +1,1 @@
+"""A proof that no other registration explains the pairs as well."""

@@ -1,0 +1,202 @@
+"""The certificate of one camera epoch's registration: what is proved about all others.
+
+The statement. With the beam, the rig's constants, the inliers, and the beams' covariances as estimated (and how each
+line moves with its marker's error, to first order), the windows as the Gaussians that the optimum has, and all else
+free (the registration, and each PM in space):
+
+- no registration, of any rotation and any translation, has a chi square of the pairs below ``least``;
+- every one whose chi square is within ``within_chi2`` of the estimate's is turned by at most ``within_rad`` from it,
+  and moves the middle of the PMs by at most ``within_mm``; and the rotations that were not excluded hang together.
+
+What the pairs pull the beam to is part of the estimate, and a wrong registration pulls it to where it fits. So a second
+proof, with the beam as it is without the pairs, says where registrations are that are no worse than the one nearest to
+the estimate.
+
+The proof is a branch and bound over all rotations (fgreg.certificate.search); rounding is allowed for, not bounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.certificate.bound import Intervals, lower_bounds
+from fgreg.certificate.conditional import Conditional, conditional
+from fgreg.certificate.rotations import Cells
+from fgreg.certificate.search import Found, angle_between, farthest, search
+from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, make_transform
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.reduced_blocks import PrivateState
+from fgreg.graph.shared_state import SharedState
+
+RELATIVE_GAP, LEAST_GAP = 1e-3, 1e-3
+"""Gap up to which the minimum counts as proved: relative to the chi square, and at least as much of it (few pairs fit
+exactly, and differences as small are none)."""
+FINE_RAD = np.radians(1.6)
+"""Cells that may hold another registration are halved to this."""
+NEAR_RAD = np.radians(10.0)
+"""Possible registrations farther than this from the estimate, and from each other, are worth a local search."""
+ABOUT_RAD = np.radians(30.0)
+"""Registrations that may be turned by more than this are no longer about the estimate."""
+MOST_STARTS = 8
+FEW_CELLS = 500
+"""Up to as many cells left by the search for others, the search for a better one starts from these."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Certificate:
+    """What was shown of one epoch's registration.
+
+    Attributes:
+        cost: chi square of its pairs at the estimate. least: no registration has less.
+        within_chi2: of the estimate's chi square, for the rest. within_rad, within_mm: see the module.
+        finished: whether the search for others came to its end. regions: number of separate regions of rotations in
+            which they may be (1: about the estimate).
+        holds_without_pairs: whether, with the beam as it is without the pairs, all registrations that are no worse than
+            the one near the estimate are near it as well.
+        starts: (n, 4, 4) registrations to start a local search from: far from the estimate, and not excluded.
+        looked_at: cells times PMs that were bounded.
+    """
+
+    cost: float
+    least: float
+    within_chi2: float
+    within_rad: float
+    within_mm: float
+    finished: bool
+    regions: int
+    holds_without_pairs: bool
+    starts: FloatArray
+    looked_at: int
+
+    @property
+    def gap(self) -> float:
+        """Relative gap between the chi square and its lower bound."""
+        return max(self.cost - self.least, 0.0) / max(self.cost, LEAST_GAP)
+
+    @property
+    def is_least(self) -> bool:
+        """Whether the estimate is proved to be the best registration."""
+        return self.cost - self.least <= tolerance(self.cost)
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether all others within the threshold are proved to lie about it."""
+        return self.finished and self.regions == 1 and self.within_rad <= ABOUT_RAD
+
+
+def tolerance(cost: float) -> float:
+    """Chi square by which a lower bound may be below ``cost`` to prove it."""
+    return max(RELATIVE_GAP * cost, LEAST_GAP) * (1.0 + 1e-9)
+
+
+def certify(
+    problem: PackedProblem,
+    state: SharedState,
+    private: PrivateState,
+    epoch: int = 0,
+    without_pairs: tuple[SharedState, PrivateState] | None = None,
+    *,
+    within_chi2: float,
+    budget: int,
+) -> Certificate | None:
+    """The certificate of an epoch's registration.
+
+    Args:
+        problem: the inliers. state, private: their optimum (one hypothesis).
+        epoch: place of the epoch.
+        without_pairs: the optimum near by with the beam held where it is without the pairs; None: not known.
+        within_chi2: see :class:`Certificate`.
+        budget: number of cells times PMs to bound at most, in all searches (about 3 us each).
+
+    Returns:
+        None where a PM is nearer to the array than the array to its axis, which the bounds do not cover.
+    """
+    of = conditional(problem, state, private, epoch)
+    cost = cost_at(of)
+    enough = cost - max(RELATIVE_GAP * cost, LEAST_GAP)
+    others = search(of, cost + within_chi2, reach_rad=FINE_RAD, budget=budget // 8)
+    if others is None:
+        return None
+    few = others.finished and len(others.region.cells) <= FEW_CELLS
+    start = others.region if few else None
+    best = search(of, cost, reach_rad=0.0, budget=3 * budget // 4, enough=enough, start=start)
+    assert best is not None
+    region = others.region
+    away = farthest(region.cells, of.rotation)
+    labels = _regions(region.cells, of.rotation)
+    starts, looked_at, holds = [_starts(of, others, away)], best.looked_at + others.looked_at, False
+    if without_pairs is not None:
+        there = conditional(problem, *without_pairs, epoch)
+        again = search(there, cost_at(there), reach_rad=FINE_RAD, budget=budget // 8)
+        assert again is not None
+        far = farthest(again.region.cells, of.rotation)
+        near = float(away.max(initial=0.0)) + angle_between(there.rotation, of.rotation) + 2.0 * FINE_RAD
+        holds = again.finished and bool((far <= near).all())
+        looked_at += again.looked_at
+        starts.append(_starts(there, again, far))
+    return Certificate(
+        cost=cost,
+        least=max(best.least, 0.0),
+        within_chi2=within_chi2,
+        within_rad=float(away.max(initial=0.0)),
+        within_mm=_shifted(of, others),
+        finished=others.finished,
+        regions=int(labels.max(initial=0)) + 1,
+        holds_without_pairs=holds,
+        starts=np.concatenate(starts),
+        looked_at=looked_at,
+    )
+
+
+def cost_at(of: Conditional) -> float:
+    """The chi square at the estimate's registration and PMs."""
+    point = Intervals(of.polar[..., None], np.full((*of.polar.shape, 1), 1e-12))
+    found = lower_bounds(of, of.rotation[..., None], np.array([1e-12]), point, np.inf)
+    return float(found.cost[0])
+
+
+def _shifted(of: Conditional, others: Found) -> float:
+    """How far the middle of the PMs moves, at most: |s - s of the estimate|, mm."""
+    bounds = others.region.bounds
+    if not len(bounds.cost):
+        return 0.0
+    spread = np.linalg.eigvalsh(bounds.moved[3:, 3:].transpose(2, 0, 1))[:, -1]
+    off = np.linalg.norm(bounds.shift - of.shift[:, None], axis=0)
+    return float((off + np.sqrt(np.maximum(spread, 0.0))).max())
+
+
+def _regions(cells: Cells, rotation: FloatArray) -> IntArray:
+    """(n,) number of the connected region of each cell, 0 for that of a rotation (3, 3), if any is about it."""
+    from scipy.sparse import coo_matrix  # slow to load
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    count = len(cells)
+    if not count:
+        return np.zeros(0, dtype=np.int64)
+    q = cells.quaternion
+    reach = float(cells.reach_rad.max())
+    near = cKDTree(np.concatenate([q, -q])).query_pairs(2.0 * np.sin(0.5 * reach) * (1.0 + 1e-9), output_type="ndarray")
+    pairs = near % count
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    _, labels = connected_components(graph, directed=False)
+    mine = labels[int(np.argmin(farthest(cells, rotation) - cells.reach_rad))]
+    return np.where(labels == mine, 0, np.where(labels < mine, labels + 1, labels))
+
+
+def _starts(of: Conditional, others: Found, away: FloatArray) -> FloatArray:
+    """Registrations in cells far from the estimate and from each other, the farthest first."""
+    cells, bounds = others.region.cells, others.region.bounds
+    chosen: list[int] = []
+    distance = away - cells.reach_rad
+    while len(chosen) < MOST_STARTS and len(cells) and distance.max() > NEAR_RAD:
+        index = int(np.argmax(distance))
+        chosen.append(index)
+        distance = np.minimum(distance, farthest(cells, cells.rotation[index]) - cells.reach_rad)
+    out = np.zeros((len(chosen), 4, 4))
+    for row, index in enumerate(chosen):
+        rotation = cells.rotation[index] @ exp_so3(bounds.turn[:, index])
+        out[row] = make_transform(rotation, rotation @ bounds.shift[:, index] + of.pivot)
+    return out

@@ -1,0 +1,259 @@
+"""The certificate: its cost is the graph's, no registration is below its bounds, and only the best one is certified."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from typer.testing import CliRunner
+
+from fgreg.certificate.bound import Intervals, first_intervals, lower_bounds, sharper_bounds
+from fgreg.certificate.certify import Certificate, certify, cost_at
+from fgreg.certificate.conditional import Conditional, Looks, conditional
+from fgreg.certificate.rotations import Cells
+from fgreg.certificate.search import farthest, narrowed
+from fgreg.cli.main import app
+from fgreg.geometry.transforms import FloatArray, exp_so3
+from fgreg.graph.reduced_graph import contributions, private_at, refine
+from fgreg.graph.reduced_solver import optimize
+from fgreg.model.estimate import Verdict
+from fgreg.model.session_model import NoiseModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.systematic import Systematic
+from fgreg.registration.multistart import targets_moved
+from fgreg.registration.proof import prove, without_pairs
+from fgreg.registration.register import Registration, register
+from fgreg.registration.solve import solve
+from fgreg.session.result_file import read_result
+from tests.forward import make_measurements, make_session
+
+BUDGET = 300_000
+
+
+@cache
+def _registered(seed: int, **arguments: Any) -> Registration:
+    noise = arguments.pop("noise_model", None)
+    tilt = arguments.pop("tilt_rad", 0.0035)
+    session = make_session(noise_model=noise, systematic=Systematic(array_tilt_rad=(tilt,) * 3))
+    model, measurements, _ = make_measurements(np.random.default_rng(seed), session=session, **arguments)
+    return register(measurements, model, SolveConfig())
+
+
+def _conditional(of: Registration) -> Conditional:
+    return conditional(of.problem, of.optimum.state, of.optimum.evaluation.private)
+
+
+def _certify(of: Registration, budget: int = BUDGET) -> Certificate:
+    optimum = of.optimum
+    apart = without_pairs(of, 0)
+    found = certify(of.problem, optimum.state, optimum.evaluation.private, 0, apart, within_chi2=9.2, budget=budget)
+    assert found is not None
+    return found
+
+
+def _rotation_offset(q: FloatArray, look: Looks, radius_mm: float) -> FloatArray:
+    """Stage rotation that brings a point of the array's frame into the plane, at the range that was heard."""
+    distance = np.hypot(q[1], q[2])
+    return np.asarray(np.arctan2(look.heard_mm * q[1] / distance, radius_mm + look.heard_mm * q[2] / distance))
+
+
+def _residuals(of: Conditional, rotation: FloatArray, shift: FloatArray, polar: FloatArray) -> FloatArray:
+    """All residuals of a registration and PMs, in standard deviations."""
+
+    def look_residuals(look: Looks, q: FloatArray) -> FloatArray:
+        miss = [q[0] - look.x_mm, np.hypot(q[1], q[2]) - look.heard_mm]
+        miss.append(_rotation_offset(q, look, of.radius_mm) - look.rotation_rad)
+        root = np.linalg.cholesky(look.weight.transpose(2, 0, 1))
+        return np.asarray(np.einsum("nji,jn->in", root, np.stack(miss)).ravel())
+
+    q = np.stack([polar[0], polar[1] * np.sin(polar[2]), polar[1] * np.cos(polar[2])])
+    camera_p = rotation.T @ (np.einsum("ijn,jn->in", of.from_array, q) + of.origin) - shift[:, None]
+    there = np.einsum("ijn,jn->in", of.others.from_first, q[:, of.others.pm]) + of.others.origin
+    beams = (np.einsum("min,in->mn", of.rows, camera_p) + of.offset).ravel()
+    return np.concatenate([beams, look_residuals(of.first, q), look_residuals(of.others, there)])
+
+
+def _best_fit(of: Conditional, rotation: FloatArray, shift: FloatArray | None) -> tuple[FloatArray, FloatArray, float]:
+    """Shift, PMs and chi square of a rotation, from a local search by a generic solver; the shift given or not."""
+    free = 3 if shift is None else 0
+
+    def unpacked(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return (x[:3] if shift is None else shift), x[free:].reshape(of.polar.shape)
+
+    scale = np.concatenate([np.ones(free), np.ones(of.polar[:2].size), np.full(of.polar[2].size, 0.05)])
+    start = np.concatenate([of.shift[:free], of.polar.ravel()])
+
+    def residuals(x: FloatArray) -> FloatArray:
+        return _residuals(of, rotation, *unpacked(x))
+
+    found = least_squares(residuals, start, x_scale=scale)
+    return *unpacked(found.x), float(2.0 * found.cost) + of.constant
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "first hit": {"pairs": 8},
+    "window only, tilted array": {"pairs": 8, "first_hit": False, "tilt_rad": 0.03},
+    "three looks, one shot": {"pairs": 6, "looks_per_pm": 3, "share_marker": True, "tilt_rad": 0.03},
+    "two looks, own shots": {"pairs": 6, "looks_per_pm": 2},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_cost_is_that_of_the_reduced_graph(case: str) -> None:
+    # A marker that is known to turn by nothing: the graph's weights do not depend on where along a beam the PM is.
+    exact = NoiseModel(marker_rotation_rad=(1e-7, 1e-7, 1e-7))
+    found = _registered(3, **CASES[case], noise_model=exact)
+    of, rng, state = _conditional(found), np.random.default_rng(0), found.optimum.state
+    for size in (0.0, 0.01, 0.05):
+        turned = state.rotation[0, 0] @ exp_so3(size * rng.normal(size=3))
+        moved = state.translation_mm[0, 0] + 30.0 * size * rng.normal(size=3)
+        there = replace(state, rotation=turned[None, None], translation_mm=moved[None, None])
+        private = private_at(found.problem, there)
+        for _ in range(20):
+            _, private = refine(found.problem, there, private)
+        expected = float(contributions(found.problem, there, private).pm.cost.sum())
+        _, _, cost = _best_fit(of, turned, turned.T @ (moved - of.pivot))
+        assert cost == pytest.approx(expected, rel=1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_bound_of_a_cell_is_above_the_cost_of_a_registration_in_it(case: str) -> None:
+    of, rng, cells = _conditional(_registered(5, **CASES[case])), np.random.default_rng(1), 150
+    for away in (0.0, 0.02, 0.1, 1.0):
+        rotation = of.rotation @ exp_so3(away * rng.normal(size=3))
+        shift, polar, cost = _best_fit(of, rotation, None)
+        reach = 10.0 ** rng.uniform(-3.0, 0.0, cells)
+        turn = rng.normal(size=(cells, 3))
+        turn *= (reach * rng.uniform(size=cells) ** 0.1 / np.linalg.norm(turn, axis=1))[:, None]
+        centres = np.stack([rotation @ exp_so3(-step) for step in turn], axis=-1)
+        for threshold in (cost + 1e-6, cost + 9.2):
+            first = first_intervals(of, threshold)
+            assert first is not None
+            intervals = Intervals(*(np.repeat(values, cells, axis=-1) for values in (first.centre, first.half)))
+            plain = narrowed(of, centres, reach, intervals, threshold)
+            for found in (plain, sharper_bounds(of, centres, reach, plain, threshold)):
+                assert found.possible.all()
+                assert (found.cost <= cost * (1.0 + 1e-6) + 1e-6).all()
+                outside = np.maximum(found.intervals.low - polar[..., None], polar[..., None] - found.intervals.high)
+                assert outside.max() <= 1e-6
+                off = np.concatenate([turn.T - found.turn, shift[:, None] - found.shift]).T
+                ellipsoid = found.moved.transpose(2, 0, 1) + 1e-12 * np.eye(6)
+                assert (np.einsum("bi,bi->b", off, np.linalg.solve(ellipsoid, off[..., None])[..., 0]) < 1.001).all()
+
+
+def test_bounds_of_small_cells_come_near_the_cost() -> None:
+    of = _conditional(_registered(5, pairs=8))
+    cost, reach = cost_at(of), np.radians([1.0, 0.5])
+    first = first_intervals(of, cost)
+    assert first is not None
+    intervals = Intervals(*(np.repeat(values, 2, axis=-1) for values in (first.centre, first.half)))
+    centres = np.repeat(of.rotation[..., None], 2, axis=-1)
+    plain = narrowed(of, centres, reach, intervals, cost)
+    sharper = sharper_bounds(of, centres, reach, plain, cost)
+    assert (lower_bounds(of, centres, reach, intervals, cost).cost <= plain.cost).all()
+    loss = cost - sharper.cost
+    assert loss[1] < 0.2 * loss[0]  # of third order or better: an eighth of it or less
+    assert loss[1] < 1e-3 * cost
+
+
+def test_cells_cover_all_rotations_and_so_do_their_halves() -> None:
+    cells, rng = Cells.cover(3), np.random.default_rng(2)
+    for _ in range(50):
+        rotation = exp_so3(rng.normal(size=3) * 2.0)
+        away = farthest(cells, rotation) - cells.reach_rad
+        inside = np.flatnonzero(away <= cells.reach_rad)
+        assert len(inside)
+        parts = cells.take(inside).halved()
+        assert (farthest(parts, rotation) - parts.reach_rad <= parts.reach_rad).any()
+    assert cells.halved().reach_rad.max() < 0.75 * cells.reach_rad.max()
+
+
+def test_the_best_registration_is_certified_and_nothing_is_below_the_bound() -> None:
+    found = _registered(11, pairs=10)
+    certificate, of, rng = _certify(found), _conditional(found), np.random.default_rng(3)
+    assert certificate.is_least
+    assert certificate.is_alone
+    assert certificate.gap <= 1.0001e-3
+    for _ in range(12):
+        rotation = of.rotation @ exp_so3(rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 0.3))
+        _, _, cost = _best_fit(of, rotation, None)
+        assert cost >= certificate.least
+        angle = 2.0 * math.asin(min(float(np.linalg.norm(rotation - of.rotation)) / math.sqrt(8.0), 1.0))
+        assert cost > certificate.cost + 9.2 or angle <= certificate.within_rad
+
+
+def _at_another_minimum(found: Registration) -> Registration:
+    """The registration with its second minimum in place of the best."""
+    second = found.searches[0].minima[1].state
+    state = found.optimum.state
+    moved = replace(state, rotation=second.rotation, translation_mm=second.translation_mm)
+    return replace(found, optimum=optimize(found.problem, moved))
+
+
+def test_a_worse_minimum_is_not_certified_and_the_better_one_is_handed_back() -> None:
+    best = _registered(1018, pairs=6)
+    worse = _at_another_minimum(best)
+    here, there = (of.optimum.state.trus_T_camera()[0] for of in (worse, best))
+    assert worse.optimum.evaluation.cost[0] > best.optimum.evaluation.cost[0] + 9.2
+    proof = prove(worse, 0, SolveConfig(certificate_budget=20_000))
+    assert proof is not None
+    assert not proof.estimate.proved
+    assert [condition.verdict for condition in proof.conditions] == [Verdict.REFUSED]
+    assert "a better registration" in proof.conditions[0].text
+    assert proof.estimate.other_trus_T_camera is not None
+    assert targets_moved(there, proof.estimate.other_trus_T_camera, best.model.targets_mm) < 0.1
+    assert targets_moved(there, here, best.model.targets_mm) > 1.5
+
+
+def test_two_minima_are_recognised_by_the_bound() -> None:
+    found = _registered(1002, pairs=4)
+    assert found.ambiguous
+    certificate = _certify(found)
+    assert certificate.finished
+    assert not certificate.is_alone
+    # The search that knows of neither comes upon the other one.
+    proof = prove(replace(found, ambiguous=(), searches=(replace(found.searches[0], minima=()),)), 0, _PROVING)
+    assert proof is not None
+    assert [condition.verdict for condition in proof.conditions] == [Verdict.REFUSED]
+    assert "another registration" in proof.conditions[0].text
+
+
+_PROVING = SolveConfig(certificate_budget=BUDGET)
+
+
+def test_a_proof_that_stops_early_leaves_the_verdict() -> None:
+    found = _registered(12, pairs=10)
+    for budget, expected in ((2000, "not certified: "), (0, None)):
+        proof = prove(found, 0, SolveConfig(certificate_budget=budget))
+        assert (proof is None) == (expected is None)
+        if proof is not None:
+            assert proof.conditions[0].text.startswith("not certified: the search for a better one stopped with a gap")
+            assert proof.conditions[0].verdict is Verdict.OK
+            assert proof.estimate.reason == proof.conditions[0].text
+
+
+def test_epochs_with_a_measured_motion_are_not_certified() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(1), pairs=12, epochs=2, known_motion=True)
+    plain = solve(measurements, [], model, SolveConfig())
+    proving = solve(measurements, [], model, _PROVING)
+    assert proving.verdict is plain.verdict
+    assert [epoch.certificate is None for epoch in plain.epochs] == [True, True]
+    assert all(epoch.certificate is not None and not epoch.certificate.proved for epoch in proving.epochs)
+    assert sum("not certified: it also rests on a measured" in reason for reason in proving.reasons) == 2
+
+
+def test_the_command_says_what_is_proved(pose_session: Path) -> None:
+    done = CliRunner().invoke(app, ["solve", str(pose_session), "--certify"])
+    assert done.exit_code == 0
+    assert "no other registration explains these pairs" in " ".join(done.output.split())
+    certificate = read_result(pose_session / "result.yaml").epochs[0].certificate
+    assert certificate is not None
+    assert certificate.proved
+    assert certificate.within_rad is not None
+    assert certificate.within_rad < math.radians(15.0)
