@@ -314,7 +314,7 @@ def _minimum(hessian: FloatArray, pull: FloatArray, normal: FloatArray, reach: F
     schur = n - across @ inverse @ np.swapaxes(across, 1, 2)
     values, vectors = np.linalg.eigh(schur[:, :3, :3])
     g2 = np.square(np.einsum("bij,bi->bj", vectors, schur[:, :3, 6]))
-    least_mu = np.maximum(1e-9 * np.abs(values).max(axis=1) - values[:, 0], 0.0)
+    least_mu = np.maximum(1e-9 * (1.0 + np.abs(values).max(axis=1)) - values[:, 0], 0.0)
     mu, square = least_mu.copy(), reach**2
     for _ in range(_NEWTON):  # |omega(mu)| = reach; 1 / |omega| is nearly linear in mu
         size = np.sum(g2 / (values + mu[:, None]) ** 2, axis=1) + 1e-300

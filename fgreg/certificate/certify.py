@@ -129,10 +129,10 @@ def certify(
     starts, looked_at, holds = [_starts(of, others, away)], best.looked_at + others.looked_at, False
     if without_pairs is not None:
         there = conditional(problem, *without_pairs, epoch)
-        again = search(there, cost_at(there), reach_rad=FINE_RAD, budget=budget // 8)
+        again = search(there, cost_at(there), reach_rad=2.0 * FINE_RAD, budget=budget // 8)
         assert again is not None
         far = farthest(again.region.cells, of.rotation)
-        near = float(away.max(initial=0.0)) + angle_between(there.rotation, of.rotation) + 2.0 * FINE_RAD
+        near = float(away.max(initial=0.0)) + angle_between(there.rotation, of.rotation) + 4.0 * FINE_RAD
         holds = again.finished and bool((far <= near).all())
         looked_at += again.looked_at
         starts.append(_starts(there, again, far))
