@@ -188,9 +188,9 @@ def test_the_best_registration_is_certified_and_nothing_is_below_the_bound() -> 
         assert cost > certificate.cost + 9.2 or angle <= certificate.within_rad
 
 
-def _at_another_minimum(found: Registration) -> Registration:
-    """The registration with its second minimum in place of the best."""
-    second = found.searches[0].minima[1].state
+def _at_another_minimum(found: Registration, which: int = 1) -> Registration:
+    """The registration with one of its minima in place of the best."""
+    second = found.searches[0].minima[which].state
     state = found.optimum.state
     moved = replace(state, rotation=second.rotation, translation_mm=second.translation_mm)
     return replace(found, optimum=optimize(found.problem, moved))
@@ -209,6 +209,21 @@ def test_a_worse_minimum_is_not_certified_and_the_better_one_is_handed_back() ->
     assert proof.estimate.other_trus_T_camera is not None
     assert targets_moved(there, proof.estimate.other_trus_T_camera, best.model.targets_mm) < 0.1
     assert targets_moved(there, here, best.model.targets_mm) > 1.5
+
+
+@pytest.mark.parametrize(("seed", "which"), [(1009, 3), (1034, 2), (1019, 2)])
+def test_without_the_pairs_pull_the_cost_hardly_depends_on_the_minimum(seed: int, which: int) -> None:
+    best = _registered(seed, pairs=4)
+    worse, rotation = _at_another_minimum(best, which), best.optimum.state.rotation[0, 0]
+    costs = []
+    for found in (best, worse):
+        apart = without_pairs(found, 0)
+        assert apart is not None
+        of = conditional(found.problem, apart.state, apart.private, 0, apart.distance_mm)
+        costs.append((cost_at(of), _best_fit(of, rotation, None)[2]))
+    (_, of_best), (of_worse, seen_from_worse) = costs
+    assert seen_from_worse == pytest.approx(of_best, rel=0.25, abs=0.5)
+    assert of_worse > seen_from_worse + 9.2
 
 
 def test_two_minima_are_recognised_by_the_bound() -> None:

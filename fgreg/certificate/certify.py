@@ -1,16 +1,15 @@
 """The certificate of one camera epoch's registration: what is proved about all others.
 
-The statement. With the beam, the rig's constants, the inliers, and the beams' covariances as estimated (and how each
-line moves with its marker's error, to first order), the windows as the Gaussians that the optimum has, and all else
-free (the registration, and each PM in space):
+The statement. With the beam, the rig's constants, the inliers, and the beams' covariances as estimated, the windows as
+the Gaussians that the optimum has, and all else free (the registration, and each PM in space):
 
 - no registration, of any rotation and any translation, has a chi square of the pairs below ``least``;
 - every one whose chi square is within ``within_chi2`` of the estimate's is turned by at most ``within_rad`` from it,
   and moves the middle of the PMs by at most ``within_mm``; and the rotations that were not excluded hang together.
 
 What the pairs pull the beam to is part of the estimate, and a wrong registration pulls it to where it fits. So a second
-proof, with the beam as it is without the pairs, says where registrations are that are no worse than the one nearest to
-the estimate.
+proof, with the beam as it is without the pairs and covariances at the aims' distance, says where registrations are that
+are no worse than the one nearest to the estimate.
 
 The proof is a branch and bound over all rotations (fgreg.certificate.search); rounding is allowed for, not bounded.
 """
@@ -42,6 +41,19 @@ ABOUT_RAD = np.radians(30.0)
 MOST_STARTS = 8
 FEW_CELLS = 500
 """Up to as many cells left by the search for others, the search for a better one starts from these."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WithoutPairs:
+    """The optimum near the estimate with the beam held where it is without the pairs.
+
+    ``distance_mm``: usual distance of a spot along the beam, for the beams' covariances. So the cost is nearly the same
+    function of the registration whichever estimate is to be certified.
+    """
+
+    state: SharedState
+    private: PrivateState
+    distance_mm: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +108,7 @@ def certify(
     state: SharedState,
     private: PrivateState,
     epoch: int = 0,
-    without_pairs: tuple[SharedState, PrivateState] | None = None,
+    without_pairs: WithoutPairs | None = None,
     *,
     within_chi2: float,
     budget: int,
@@ -106,7 +118,7 @@ def certify(
     Args:
         problem: the inliers. state, private: their optimum (one hypothesis).
         epoch: place of the epoch.
-        without_pairs: the optimum near by with the beam held where it is without the pairs; None: not known.
+        without_pairs: None where the beam is not known without the pairs.
         within_chi2: see :class:`Certificate`.
         budget: number of cells times PMs to bound at most, in all searches (about 3 us each).
 
@@ -128,7 +140,8 @@ def certify(
     labels = _regions(region.cells, of.rotation)
     starts, looked_at, holds = [_starts(of, others, away)], best.looked_at + others.looked_at, False
     if without_pairs is not None:
-        there = conditional(problem, *without_pairs, epoch)
+        near_by = without_pairs
+        there = conditional(problem, near_by.state, near_by.private, epoch, near_by.distance_mm)
         again = search(there, cost_at(there), reach_rad=2.0 * FINE_RAD, budget=budget // 8)
         assert again is not None
         far = farthest(again.region.cells, of.rotation)

@@ -1,7 +1,8 @@
 """The cost of one camera epoch's pairs as a function of its registration alone.
 
 The reduced graph's chi square of the pairs, with everything else as estimated: the beam, the rig's constants, which
-shots are inliers, and of each beam its covariance and how its line moves with the marker's error. Then a beam's
+shots are inliers, and each beam's covariance (which grows with the distance along it; here it is that where the PM is
+estimated). The markers' errors enter to first order about their estimates, as covariance. Then a beam's
 whitened residual is linear in its PM, camera axes (``rows camera_p + offset``), whatever the registration: the weights
 across a beam do not depend on it. Those of a look act along the TRUS axes and do turn with it, so a PM stays a
 variable. It is written in polar coordinates of its first look, in which x and range are exactly linear:
@@ -78,13 +79,21 @@ class Conditional:
     polar: FloatArray
 
 
-def conditional(problem: PackedProblem, state: SharedState, private: PrivateState, epoch: int = 0) -> Conditional:
+def conditional(
+    problem: PackedProblem,
+    state: SharedState,
+    private: PrivateState,
+    epoch: int = 0,
+    distance_mm: float | None = None,
+) -> Conditional:
     """The cost of one epoch at an optimum (one hypothesis).
 
     Args:
         problem: the inliers.
         state, private: their optimum.
         epoch: place of the epoch.
+        distance_mm: take the beams' covariances at this distance along them, not where the PMs are, and the markers'
+            errors about their observed poses: nothing of the lines depends on the estimate of PMs and markers then.
     """
     rotation, translation = state.rotation[0, epoch], state.translation_mm[0, epoch]
     mine = np.unique(problem.beam_pm[problem.beam_epoch == epoch])
@@ -92,7 +101,7 @@ def conditional(problem: PackedProblem, state: SharedState, private: PrivateStat
     place[mine] = np.arange(len(mine))
     points = private.trus_p_pm[0][mine]
     pivot = points.mean(axis=0)
-    rows, offset, constant = _lines(problem, state, private, epoch, place, rotation, translation)
+    rows, offset, constant = _lines(problem, state, private, epoch, place, distance_mm)
     looks, matrix, origin = _looks(problem, state, place)
     first = np.array([int(np.flatnonzero(looks.pm == j)[0]) for j in range(len(mine))], dtype=np.int64)
     rest = np.setdiff1d(np.arange(len(looks.pm)), first)
@@ -131,15 +140,19 @@ def _lines(
     private: PrivateState,
     epoch: int,
     place: IntArray,
-    rotation: FloatArray,
-    translation: FloatArray,
+    distance_mm: float | None,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Rows (m, 3, J), offsets (m, J) and constant of the beams; a PM with several has their stack, as few rows."""
     index = np.flatnonzero(problem.beam_epoch == epoch)
     beams = BeamArrays(*(getattr(problem.beams, name)[index] for name in BeamArrays.__slots__))
     pm = problem.beam_pm[index]
-    camera_p = (private.trus_p_pm[0][pm] - translation) @ rotation
-    block = line_block(beams, inner(private.beam_error)[index], Chart.of(state), camera_p[..., None])
+    error = inner(private.beam_error)[index]
+    if distance_mm is None:
+        camera_p = (private.trus_p_pm[0][pm] - state.translation_mm[0, epoch]) @ state.rotation[0, epoch]
+    else:
+        marker_p = state.beam_origin()[0] + distance_mm * state.beam_direction()[0]
+        camera_p, error = beams.rotation @ marker_p + beams.translation_mm, np.zeros_like(error)
+    block = line_block(beams, error, Chart.of(state), camera_p[..., None])
     white = Whitening.of(block.covariance).rows(block.rows)[..., 0]  # (n, 4, 2)
     matrix = white[:, 1:].swapaxes(1, 2)
     offset = white[:, 0] - np.einsum("nij,nj->ni", matrix, camera_p)

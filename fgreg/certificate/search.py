@@ -22,8 +22,8 @@ ROUNDS = 6
 """Largest number of times that the intervals of a cell are narrowed before it is halved."""
 NARROWED = 0.8
 """Intervals that narrow to more than this part of what they were are not narrowed again."""
-AT_ONCE = 30_000
-"""Number of cells times PMs that are bounded in one call, for the memory."""
+AT_ONCE = 12_000
+"""Number of cells times PMs that are bounded in one call: more do not stay in the cache."""
 BALLS = np.radians(10.0) * 0.75 ** np.arange(20)
 """Radii about the estimate that are tried as one cell."""
 _NONE = np.zeros(0, dtype=np.int64)

@@ -13,13 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.certificate.certify import Certificate, certify
+from fgreg.certificate.certify import Certificate, WithoutPairs, certify
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_graph import contributions, evaluate, private_at, refine
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.scaled_inverse import inverse_hessian
-from fgreg.graph.shared_state import SharedState
 from fgreg.model.estimate import CertificateEstimate, Verdict
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import has_registration
@@ -81,7 +79,7 @@ def prove(registration: Registration, epoch: int, config: SolveConfig) -> Proof 
     return proof_of(found, others, pms, float(optimum.evaluation.cost[0]))
 
 
-def without_pairs(registration: Registration, place: int) -> tuple[SharedState, PrivateState] | None:
+def without_pairs(registration: Registration, place: int) -> WithoutPairs | None:
     """The optimum of an epoch's registration with the beam as aims and priors have it, all else as estimated.
 
     None where these do not determine the beam.
@@ -103,7 +101,9 @@ def without_pairs(registration: Registration, place: int) -> tuple[SharedState, 
         step = np.zeros((1, problem.columns.size))
         step[0, pose] = -np.linalg.solve(at.hessian[0, pose, pose], at.gradient[0, pose])
         state, private = state.retract(step, problem.columns), at.private
-    return state, refine(problem, state, private)[1]
+    lambdas = [optimum.evaluation.aim_lambda_mm[0], optimum.evaluation.lambda_mm[0]]
+    distance_mm = float(np.median(np.abs(lambdas[0] if len(lambdas[0]) else lambdas[1])))
+    return WithoutPairs(state, refine(problem, state, private)[1], distance_mm)
 
 
 def other_minima(registration: Registration, place: int, starts: FloatArray, config: SolveConfig) -> tuple[Other, ...]:
