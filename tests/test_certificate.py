@@ -272,3 +272,11 @@ def test_the_command_says_what_is_proved(pose_session: Path) -> None:
     assert certificate.proved
     assert certificate.within_rad is not None
     assert certificate.within_rad < math.radians(15.0)
+
+
+@pytest.mark.parametrize("more", [{"spot_sigma_mm": (0.3, 0.3, 1.0)}, {"points": 3}])
+def test_what_the_bounds_do_not_cover_is_not_certified(more: dict[str, Any]) -> None:
+    proof = prove(_registered(1, pairs=6, **more), 0, _PROVING)
+    assert proof is not None
+    assert not proof.estimate.proved
+    assert "do not cover visible spots" in proof.conditions[0].text

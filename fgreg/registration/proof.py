@@ -59,6 +59,8 @@ def prove(registration: Registration, epoch: int, config: SolveConfig) -> Proof 
         problem.anchor is not None and has_registration(problem.anchor)
     ):
         return _not_certified("it also rests on a measured camera motion")
+    if len(problem.spots.beam) or len(problem.points):
+        return _not_certified("the bounds do not cover visible spots of pairs, nor points known to both devices")
     if len(search.minima) > 1 and search.minima[1].cost - search.minima[0].cost < config.second_minimum_chi2:
         return _not_certified("initial.trus_T_camera decides between two registrations that explain the pairs")
     found = certify(
