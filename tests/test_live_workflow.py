@@ -27,14 +27,14 @@ def rehearsal(seed: int = 3, *, aims: int = 8, frame_s: float = 1.0 / 15.0, **op
 
 @pytest.fixture(scope="module")
 def whole() -> Rehearsal:
-    """A session up to following, and a minute of it."""
+    """A session up to following, and 80 s of it."""
     session = rehearsal()
     while session.workflow.stage is not Stage.FOLLOWING and session.now_s < 240.0:
         session.run(1.0)
     predicted = session.engine.estimate.predicted_tre
     assert predicted is not None
     session.begun_mm = session.error_mm(), predicted.worst_mm
-    session.run(60.0)
+    session.run(80.0)
     return session
 
 
