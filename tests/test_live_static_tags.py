@@ -16,7 +16,7 @@ import pytest
 from fgreg.camera_moves.recorded_tags import with_tag_moves
 from fgreg.detection.events_to_measurements import number_epochs
 from fgreg.detection.marker import ViewCorners
-from fgreg.detection.static_tags import static_tag_fits, tags_beside
+from fgreg.detection.static_tags import BOARD, StaticView, static_poses, static_tag_fits, tags_beside
 from fgreg.detection.tags import FoundTag
 from fgreg.drivers.base import StereoFrame
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform
@@ -178,6 +178,18 @@ def test_tags_that_move_again_and_again_are_no_longer_used(pictures: Pictures) -
     assert moves == MOST_ALARMS + 1
     assert [text for text in pictures.told if "they are not fixed" in text]
     assert not pictures.tags.in_use
+
+
+def test_a_session_without_static_tags_looks_for_its_board_alone() -> None:
+    room = Room(room_config(4, 640, aims=2, bump_every_s=math.inf))
+    model = of_room(room.config)
+    assert model.camera is not None
+    assert model.marker is not None
+    assert model.static_tags == ()
+    views = tuple((picture, ()) for picture in room.pictures(0.0, 0))
+    for board, found in ((model.board, {BOARD}), (None, set())):
+        view = StaticView(views, model.camera, model.marker.dictionary, (), board)
+        assert set(static_poses(view)) == found
 
 
 def test_static_tags_are_found_in_pictures_of_the_room() -> None:

@@ -297,7 +297,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--seconds", type=float, default=200.0)
     parser.add_argument("--made-up", action="store_true", help="in simulated time, without pictures")
-    parser.add_argument("--width", type=int, default=480, help="of the camera's images, px")
+    parser.add_argument("--width", type=int, default=640, help="of the camera's images, px")
     parser.add_argument("--aims", type=int, default=6)
     parser.add_argument("--bump-every", type=float, default=90.0, help="mean time between camera moves, s")
     parser.add_argument("--out", type=Path, default=Path("study-live"), help="folder of the sessions")

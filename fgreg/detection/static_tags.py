@@ -46,6 +46,8 @@ def static_tag_fits(
         dictionary: of the tags, the marker's.
         tags: the session's static tags.
     """
+    if not tags:
+        return {}
     body = MarkerModel(dictionary, tuple(TagModel(tag.id, tag.size_mm) for tag in tags))
     by_view = [_corners(image, found, rig, view, body) for view, (image, found) in enumerate(views)]
     fits = {}
