@@ -24,6 +24,7 @@ from fgreg.online.estimate import OnlineEstimate
 from fgreg.viewer import shapes
 from fgreg.viewer.endoscope_view import PATH, REFUSED
 from fgreg.viewer.live import ViewerUpdate
+from fgreg.viewer.picture_ring import PictureRing
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.shapes import CANVAS, canvas
 from fgreg.viewer.status_line import Now
@@ -89,6 +90,24 @@ def test_of_pictures_between_events_the_file_keeps_the_newest(tmp_path: Path, mo
     assert kept == list(range(kept[0], 60)), "all of the last ones"
     assert len(rows["/summary"]) == 60, "only pictures are dropped"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.rrd"]
+
+
+def test_of_entries_of_any_size_the_newest_are_kept_unharmed(tmp_path: Path) -> None:
+    sizes = np.random.default_rng(2).integers(1, 300, 200)
+    added = [bytes([number]) * int(size) for number, size in enumerate(sizes)]
+    with PictureRing(1000, tmp_path) as ring:
+        for number, entry in enumerate(added):
+            ring.add(entry)
+            kept = list(ring)
+            assert kept == added[number + 1 - len(kept) : number + 1]
+            assert len(kept) >= 1
+        assert ring.dropped == len(added) - len(kept)
+        ring._file.close()
+        ring._file = Path("/dev/full").open("r+b", buffering=0)  # noqa: SIM115 - the ring closes it
+        dropped = ring.dropped
+        for _ in range(20):
+            ring.add(bytes(100))
+        assert ring.dropped >= dropped + 20
 
 
 def page(rows: dict[str, list[Row]], number: int) -> str:

@@ -22,7 +22,7 @@ class PictureRing:
     """
 
     def __init__(self, most_bytes: int, folder: Path) -> None:
-        self._most, self._file = most_bytes, tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed at the end
+        self._most, self._file = most_bytes, tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
         self._entries: deque[tuple[int, int]] = deque()  # offset and size, the oldest first
         self._at = 0
         self.dropped = 0
@@ -36,19 +36,28 @@ class PictureRing:
         self._file.close()
 
     def add(self, entry: bytes) -> None:
-        """Keep an entry; one that is larger than the file is dropped itself."""
+        """Keep an entry; one that is larger than the file, or that a full disk does not take, is dropped itself."""
         size = len(entry)
         if size > self._most:
             self.dropped += 1
             return
         if self._at + size > self._most:
+            while self._entries and self._entries[0][0] >= self._at:  # of the lap before, behind the last one written
+                self._entries.popleft()
+                self.dropped += 1
             self._at = 0
         end = self._at + size
         while self._entries and self._at < sum(self._entries[0]) and self._entries[0][0] < end:
             self._entries.popleft()
             self.dropped += 1
-        self._file.seek(self._at)
-        self._file.write(entry)
+        try:
+            self._file.seek(self._at)
+            whole = self._file.write(entry) == size
+        except OSError:
+            whole = False
+        if not whole:
+            self.dropped += 1
+            return
         self._entries.append((self._at, size))
         self._at = end
 
