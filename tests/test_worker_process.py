@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,11 +11,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from fgreg.workers import worker_process
+from fgreg.workers import progress, worker_process
+from fgreg.workers.progress import DISK_S, Progress
 from fgreg.workers.worker_process import WorkerProcess
 
 PATIENCE_S = 60.0
@@ -177,6 +180,11 @@ def test_an_overdue_answer_is_reported_then_its_process_is_killed(
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     assert asked(worker, 3.0) == 1.5
+    monkeypatch.setattr(worker_process, "UNKNOWN_S", 0.3)
+    assert worker._progress is not None
+    worker.answer_s, worker._progress.known, worker._progress._path = 0.05, False, Path("/nowhere")  # as on macOS
+    assert asked(worker, "sleep") is None
+    assert re.search(r"not answered for 0\.[3-9]", worker.failure)
 
 
 def test_a_process_that_works_is_slow_and_not_dead_until_it_has_worked_too_much(
@@ -305,3 +313,24 @@ def test_a_worker_ends_with_an_owner_that_is_killed(tmp_path: Path, state: str) 
         return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
 
     until(gone)
+
+
+def test_a_process_whose_disk_never_answers_hangs_and_one_that_is_ready_to_run_is_slow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, stat = [0.0], tmp_path / "stat"
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def idle_after(state: str, seconds: float) -> float:
+        stat.write_text(f"1 (a) b) {state} " + "0 " * 20, encoding="ascii")
+        watched = Progress(1)
+        watched._path = stat
+        for _ in range(round(seconds)):
+            now[0] += 1.0
+            watched.idle_s()
+        return watched.idle_s()
+
+    assert idle_after("R", 3.0 * DISK_S) == idle_after("D", 0.5 * DISK_S) == 0.0
+    assert idle_after("D", 3.0 * DISK_S) > DISK_S
+    for state in ("S", "T", "Z"):
+        assert idle_after(state, 5.0) == 5.0

@@ -27,6 +27,10 @@ NICENESS = 5
 """Added to the owner's niceness, so that a worker gives way to its owner, and its own workers to it."""
 START_S, ANSWER_S, END_S = 60.0, 120.0, 0.5
 """Default limits of start, answer and end: of the time without progress (fgreg.workers.progress)."""
+UNKNOWN_S = 10.0
+"""Least limit where the system does not tell what a process does (macOS): a slow one looks as one that hangs."""
+KILL_S = 1.0
+"""Longest wait for a killed process: one that waits for a disk that does not answer goes on until it does."""
 WORK_S = 300.0
 """Default of the most processor time for one answer: more is an endless loop."""
 SLOW_S = 2.0
@@ -197,6 +201,8 @@ class WorkerProcess(Generic[Request, Answer]):
         if self._progress is None or self._awaited is None:
             return
         limit_s = self.start_s if self._awaited == "ready" else self.answer_s
+        if not self._progress.known:
+            limit_s = max(limit_s, UNKNOWN_S)
         stuck_s = min(time.monotonic() - self._sent_s, self._progress.idle_s())
         if stuck_s >= limit_s:
             self._lose(f"has not answered for {stuck_s:.1f} s")
@@ -307,9 +313,9 @@ class _Child:
         self.send(None)
         self.process.join(patience_s)
         self.process.kill()
-        self.process.join()
+        self.process.join(KILL_S)
         self._messages.put(None)
-        self._writer.join()
+        self._writer.join(KILL_S)
         self.connection.close()
 
 
