@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fgreg.model.events import NoteEvent
+from fgreg.online.hindrances import hindrances
 from fgreg.pipeline.solve import SolveRequest, solve_session
 from tests.session_files import events, setup, write, write_frames
 
@@ -44,3 +46,15 @@ def test_a_session_with_few_pairs_names_them_as_well(tmp_path: Path) -> None:
     found = reasons(tmp_path, pairs=True)
     assert found[0].startswith("homing was stopped")
     assert len(found) > 3  # the registration's own
+
+
+def test_a_machine_that_became_fast_enough_is_no_cause() -> None:
+    slow = NoteEvent(1.0, 0, SLOW)
+    assert hindrances([slow]) == (SLOW,)
+    for text in (
+        "this machine: 30 of 30 frames/s used: fast enough again",
+        "this machine is too slow to follow the beam, but registers: 9 of 30 frames/s used",
+    ):
+        assert hindrances([slow, NoteEvent(2.0, 0, text)]) == ()
+    few = "the camera sends too few frames to register: 1 of 1 frames/s used"
+    assert hindrances([slow, NoteEvent(2.0, 0, few)]) == (few,)

@@ -8,6 +8,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,11 @@ import pytest
 import yaml
 
 from fgreg.cli.live_display import status_line
+from fgreg.detection.results import MarkerFit
 from fgreg.drivers.base import CommandKind, MotionSample, OperatorCommand, PaFrame, Registration, StereoFrame, host_now
 from fgreg.errors import EventRefused, FgregError, JournalError
 from fgreg.geometry.transforms import FloatArray, make_transform
+from fgreg.live import aims, marker_tracker
 from fgreg.live.loop import SEND_S, LiveLoop
 from fgreg.live.marker_tracker import MarkerTracker
 from fgreg.live.pulse_locator import PulseLocator
@@ -379,3 +382,32 @@ def test_an_aim_is_taken_from_a_picture_exposed_after_the_word(stand: Stand, mon
     assert taken == []
     newest = show(host_now() + 0.01)
     assert taken == [newest.left]
+    told: list[str] = []
+    monkeypatch.setattr(stand.loop._aims, "_tell", lambda tell: told.append(tell.text))
+    later = host_now() + aims.BOARD_S + 1.0
+    monkeypatch.setattr(aims, "host_now", lambda: later)
+    stand.loop._aims.step()  # the board's process does not come to an end, or to a start
+    assert told == ["no aim: the search for the board took over 30 s"]
+    assert stand.loop._aims._aiming is None
+
+
+def test_a_frame_in_hand_when_the_camera_has_moved_gives_no_pose(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker, now = stand.loop.marker_tracker, host_now()
+    found = MarkerFit(SimpleNamespace(camera_T_body=stand.marker), ())  # type: ignore[arg-type]
+
+    def process(t_s: float) -> None:
+        tracker._flying = StereoFrame(Stamp(t_s, t_s), np.zeros((2, 2), np.uint8), None, 0), t_s
+        tracker._views = [(object(),)]  # type: ignore[list-item]
+        assert tracker.poll()
+
+    monkeypatch.setattr(marker_tracker, "marker_from_views", lambda *_: found)
+    monkeypatch.setattr(marker_tracker, "marker_covariance", lambda *_: np.eye(6))
+    monkeypatch.setattr(marker_tracker, "pool_corner_noise", lambda _: None)
+    process(now - 0.5)
+    assert tracker.poses.newest() is not None
+    tracker.begin_again(now)
+    process(now - 0.3)
+    assert tracker.poses.newest() is None
+    assert "from before the camera's move" in tracker.missing
+    process(now + 0.1)
+    assert tracker.poses.newest() is not None

@@ -60,6 +60,48 @@ def test_a_slow_machine_is_the_cause_and_may_home_where_it_registers(
     assert (pace.not_yet(20.0) == "") is homes
 
 
+def frames(pace: Pace, begin_s: float, seconds: float, *, sent_hz: float, used: bool) -> list[str]:
+    """Let a camera send frames of which all are processed or none, with a step of the loop each 0.05 s."""
+    said = []
+    for k in range(round(seconds / 0.05)):
+        now = begin_s + 0.05 * k
+        if k % round(20.0 / sent_hz) == 0:
+            pace.arrived(now, 1)
+            if used:
+                pace.frame(now, 0.05)
+        pace.step(now)
+        said += pace.news(now)
+    return said
+
+
+def test_a_machine_that_processes_no_frame_any_more_is_too_slow() -> None:
+    pace = Pace(0.0)
+    frames(pace, 0.0, 10.0, sent_hz=20.0, used=True)
+    assert pace.not_yet(10.0) == ""
+    said = frames(pace, 10.0, SAY_S + 10.0, sent_hz=20.0, used=False)
+    assert said[-1].startswith("this machine is too slow to register: 0 of 20 frames/s used, longest step 50 ms")
+    assert pace.not_yet(50.0) == pace.slow
+
+
+@pytest.mark.parametrize(
+    ("hz", "says", "homes"),
+    [(2.0, "the camera sends too few frames to register: 2 of 2", False), (5.0, "the camera sends few frames", True)],
+)
+def test_a_camera_that_sends_few_frames_is_not_called_a_slow_machine(hz: float, says: str, homes: bool) -> None:
+    pace = Pace(0.0)
+    (text,) = frames(pace, 0.0, 20.0, sent_hz=hz, used=True)
+    assert text.startswith(says)
+    assert text.endswith("raise the camera's frame rate")
+    assert (pace.not_yet(20.0) == "") is homes
+
+
+def test_frames_from_before_the_first_one_that_was_processed_are_not_counted() -> None:
+    pace = Pace(0.0)
+    frames(pace, 0.0, 4.0, sent_hz=20.0, used=False)  # the processes start
+    (text,) = frames(pace, 4.0, MEASURE_S + 0.1, sent_hz=20.0, used=True)
+    assert text.startswith("this machine: 20 of 20 frames/s used")
+
+
 def test_once_the_load_is_gone_it_homes_and_says_so() -> None:
     pace = Pace(0.0)
     run(pace, 0.0, 10.0, 2.0)

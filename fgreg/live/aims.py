@@ -20,6 +20,8 @@ from fgreg.model.time_sync import TimedPose
 
 AIM_S, NO_FRAME_S = 0.3, 3.0
 """An aim is given up once a picture that came this long after it shows no marker, or none came for the second."""
+BOARD_S = 30.0
+"""An aim is given up once its board was looked for this long: the process may never be able to start."""
 
 
 class AimTaker:
@@ -72,9 +74,16 @@ class AimTaker:
     def step(self) -> None:
         """Record the pending calibration shot once its board has been detected."""
         self._begin()
-        if self._aiming is None or not self._aiming[2].done():
+        if self._aiming is None:
             return
-        (corner, pose, found), self._aiming = self._aiming, None
+        corner, pose, found = self._aiming
+        if not found.done():
+            if host_now() - pose.t_s > BOARD_S:
+                self._aiming = None
+                found.cancel()
+                self._tell(Tell(f"no aim: the search for the board took over {BOARD_S:.0f} s"))
+            return
+        self._aiming = None
         board = self._model.board
         try:
             fit = found.result()

@@ -191,7 +191,7 @@ class LiveLoop:
 
     def _say_pace(self, now: float) -> None:
         """Say what this machine can do before anything moves, and what is too slow; hold the stage until then."""
-        for text in self._pace.news(now):
+        for text in () if self.marker_tracker.trouble else self._pace.news(now):  # a dead process is not a slow machine
             self._note(text)
         self._workflow.not_yet = self._pace.not_yet(now)
 
@@ -306,7 +306,7 @@ class LiveLoop:
         if by_tags is not None:  # noticed some frames after it: pairs in between belong to the new epoch
             event = replace(event, detected=True, since_t=min(event.t, self._t(by_tags.since_s)))
         self._recorder.hand_over(event)
-        self.marker_tracker.poses.clear()  # earlier poses are in another camera frame
+        self.marker_tracker.begin_again(now)
 
     def _track_beam(self, pose: TimedPose | None) -> TrackEstimate | None:
         """Tracking result for the new pose; without one the last result, as long as its pose is recent."""

@@ -60,7 +60,7 @@ class MarkerTracker:
         self._waiting: StereoFrame | None = None
         self._flying: tuple[StereoFrame, float] | None = None  # the frame in hand, its exposure's host time
         self._views: list[tuple[ViewCorners | None] | None] = []
-        self._began_s, self._next_s = 0.0, -math.inf
+        self._began_s, self._next_s, self._from_s = 0.0, -math.inf, -math.inf
         self.poses = PoseHistory()
         self.missing = ""
         self.newest: StereoFrame | None = None
@@ -89,6 +89,11 @@ class MarkerTracker:
         done = self._flying is not None and self._take()
         self._begin()
         return done
+
+    def begin_again(self, now_s: float) -> None:
+        """The camera has moved: drop the poses, those in frames exposed before ``now_s`` too that are still in hand."""
+        self.poses.clear()
+        self._from_s = now_s
 
     def _begin(self) -> None:
         """Hand the waiting frame to the workers, if they are free."""
@@ -132,6 +137,9 @@ class MarkerTracker:
         fit = marker_from_views(left, right, self._marker)
         if isinstance(fit, NotFound):
             self.missing = fit.reason
+            return True
+        if t_s < self._from_s:  # it would be in another camera frame
+            self.missing = "the picture is from before the camera's move ended"
             return True
         self.missing = ""
         self._fits.append(fit)

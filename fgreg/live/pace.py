@@ -11,7 +11,7 @@ from collections import deque
 
 import numpy as np
 
-from fgreg.online.hindrances import TOO_SLOW
+from fgreg.online.hindrances import MACHINE, TOO_FEW, TOO_SLOW
 
 MEASURE_S, OVER_S = 3.0, 5.0
 """Time from the first processed frame until the first message; what is measured later is over the last ``OVER_S``."""
@@ -29,6 +29,9 @@ BEGIN_HZ, BEGIN_GAP_S = 3.0, 0.4
 """The same before the stage is homed, and after the machine was too slow: with some room for what comes."""
 MOST_LATENCY_S = 0.2
 """A marker that is older is not followed."""
+ALL_OF_THEM = 0.8
+"""With this share of the frames used, few of them are the camera's doing."""
+RAISE = "raise the camera's frame rate"
 LOWER = "lower the camera's picture size or frame rate, end other programs, or use --no-viewer"
 
 
@@ -81,7 +84,7 @@ class Pace:
             return []
         self._judged_s = now_s
         for figures in (self._arrived, self._frames, self._gaps):
-            while figures and figures[0][0] < now_s - OVER_S:
+            while figures and figures[0][0] < max(now_s - OVER_S, self._first_s):
                 figures.popleft()
         text, first = self._measured(now_s), self._said is None
         kind = self.slow.partition(":")[0]
@@ -98,23 +101,26 @@ class Pace:
         came, used = sum(count for _, count in self._arrived) / over_s, len(self._frames) / over_s
         latency = np.array([latency for _, latency in self._frames])
         gap_s = max((gap for _, gap in self._gaps), default=0.0)
-        if not latency.size or came < 0.5:  # no camera: reported elsewhere
+        if came < 0.5:  # no camera: reported elsewhere
             self.enough = True
             self.slow = ""
             return "this machine: no frames"
-        p50, p99 = np.quantile(latency, (0.5, 0.99))
-        text = (
-            f"{used:.0f} of {came:.0f} frames/s used, {1e3 * p50:.0f} ms from frame to angle (99 %: {1e3 * p99:.0f} "
-            f"ms), longest step {1e3 * gap_s:.0f} ms"
-        )
+        text, p50 = f"{used:.0f} of {came:.0f} frames/s used", math.inf
+        if latency.size:
+            p50, p99 = np.quantile(latency, (0.5, 0.99))
+            text += f", {1e3 * p50:.0f} ms from frame to angle (99 %: {1e3 * p99:.0f} ms)"
+        text += f", longest step {1e3 * gap_s:.0f} ms"
         least_hz, most_s = (LEAST_HZ, MOST_GAP_S) if self.enough else (BEGIN_HZ, BEGIN_GAP_S)
         self.enough = used >= least_hz and gap_s <= most_s
+        by_camera = came < GOOD_HZ and used >= ALL_OF_THEM * came and gap_s <= most_s
         if not self.enough:
-            self.slow = f"{TOO_SLOW} to register: {text}: {LOWER}"
+            self.slow = f"{TOO_FEW if by_camera else TOO_SLOW}: {text}: {RAISE if by_camera else LOWER}"
         elif p50 > MOST_LATENCY_S:
-            self.slow = f"{TOO_SLOW} to follow the beam, but registers: {text}: {LOWER}"
+            self.slow = f"{MACHINE} is too slow to follow the beam, but registers: {text}: {LOWER}"
+        elif by_camera:
+            self.slow = f"the camera sends few frames, and pairs take longer: {text}: {RAISE}"
         elif used < GOOD_HZ:
-            self.slow = f"this machine is slow, and registers with few frames: {text}: {LOWER}"
+            self.slow = f"{MACHINE} is slow, and registers with few frames: {text}: {LOWER}"
         else:
             self.slow = ""
-        return f"this machine: {text}"
+        return f"{MACHINE}: {text}"

@@ -9,15 +9,17 @@ from dataclasses import replace
 from fgreg.model.estimate import SessionEstimate
 from fgreg.model.events import Event, NoteEvent, PairEvent, StageEvent
 
-TOO_SLOW = "this machine is too slow"
-"""How notes about it begin (fgreg.live.pace)."""
+MACHINE, CAMERA = "this machine", "the camera sends"
+"""How notes about what they can do begin (fgreg.live.pace): each takes the place of the one before."""
+TOO_SLOW, TOO_FEW = "this machine is too slow to register", "the camera sends too few frames to register"
+"""How those begin that keep a session from taking pairs."""
 MEANT = ("the operator", "tracking held", "connected", "the registration is refused")
 """How the reasons of stops begin that hinder nothing."""
 MOTIONS = ("home", "search", "track")
 
 
 def hindrances(events: Sequence[Event]) -> tuple[str, ...]:
-    """Why the stage did not do what it was asked to, most frequent first; then why the machine was too slow."""
+    """Why the stage did not do what it was asked to, most frequent first; then what was too slow in the end."""
     stops: Counter[tuple[str, str]] = Counter()
     motion, slow = "", ""
     for event in events:
@@ -25,8 +27,8 @@ def hindrances(events: Sequence[Event]) -> tuple[str, ...]:
             motion = event.command
         elif isinstance(event, StageEvent) and event.command == "stop" and not event.reason.startswith(MEANT):
             stops[{"home": "homing", "search": "a search"}.get(motion, "the stage"), event.reason] += 1
-        elif isinstance(event, NoteEvent) and event.text.startswith(TOO_SLOW):
-            slow = event.text
+        elif isinstance(event, NoteEvent) and event.text.startswith((MACHINE, CAMERA)):
+            slow = event.text if event.text.startswith((TOO_SLOW, TOO_FEW)) else ""
     texts = []
     for (what, reason), count in stops.most_common():
         often = "once" if count == 1 else f"{count} times"
