@@ -38,7 +38,7 @@ from fgreg.stage.stop_on_exit import emergency_stop_all
 from fgreg.workers.progress import Progress
 from fgreg.workers.threads import undisturbed
 
-MOST_WORK_S = 30.0
+MOST_WORK_S = 10.0
 """A registration without a new snapshot for longer is lost, also where its process still works: camera moves would go
 undetected."""
 

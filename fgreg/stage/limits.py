@@ -39,7 +39,8 @@ class MotionLimits:
             until the zero position is found; from inside the limits, homing takes no more than their span.
         heartbeat_s: longest time between heartbeats of the main program while the stage follows the beam; after that it
             stops. step_heartbeat_s: the same while it homes, searches or stands: it then goes to one target that was
-            checked, and the heartbeat only shows that a stop would come through. A busy machine may take that long.
+            checked (homing: to the switch, within ``home_travel_rad``), and the heartbeat only shows that a stop would
+            come through. A busy machine may take that long.
         command_age_s: an older command is refused, since it comes from before a stall.
         status_age_s: longest time between statuses of a moving stage.
         clock_gap_s: longest time between two clock readings of the watchdog; a longer gap means that it did not run.
