@@ -47,4 +47,5 @@ def with_hindrances(estimate: SessionEstimate, events: Sequence[Event]) -> Sessi
     if not causes:
         return estimate
     none = not any(isinstance(event, PairEvent) for event in events)
-    return replace(estimate, reasons=(*causes, *estimate.reasons[1 if none else 0 :]))
+    rest = [reason for reason in estimate.reasons if not (none and "at least " in reason and "aim" not in reason)]
+    return replace(estimate, reasons=(*causes, *rest))
