@@ -42,6 +42,8 @@ SETTLE_S = 0.4
 """The surgeon sends an aim once the fibre has been still for this long."""
 SAY_AGAIN_S = 3.0
 """Time after which an aim without an effect is sent again."""
+MOST_TRIES = 3
+"""Aims without an effect at one place; then the surgeon aims in another way."""
 LOOKS_S = 1.5
 """Time that the surgeon takes to inspect the stage before a reset."""
 FAULTS = {
@@ -123,6 +125,7 @@ class RoomServer:
         )  # when, and where the plane truly stood
         self.start_s = time.monotonic()
         self._said_s = self._pictured_s = -math.inf
+        self._tries = 0
         self._pictures = 0
         self._followed = False
         self._faults = dict.fromkeys(FAULTS, "")
@@ -326,9 +329,14 @@ class RoomServer:
         roams = self._followed and rested > self._roam_s
         if (go_on and rested > 0) or roams:
             room.proceed(now_s)
-            self._said_s = -math.inf
+            self._said_s, self._tries = -math.inf, 0
         elif rested > SETTLE_S and now_s - self._said_s > SAY_AGAIN_S and room.place.corner is not None:
+            if self._tries == MOST_TRIES:
+                room.go_elsewhere(now_s)
+                self._said_s, self._tries = -math.inf, 0
+                return
             self._said_s = now_s
+            self._tries += 1
             self._say({"says": "aim", "corner": list(room.place.corner)})
 
     def _say(self, words: dict[str, Any]) -> None:

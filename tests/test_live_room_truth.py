@@ -93,3 +93,20 @@ def test_the_room_sends_it_over_its_socket_in_host_time(tmp_path: Path) -> None:
     assert abs(truth["moved_s"][0] - (began + 0.1)) < 5.0
     with pytest.raises(FgregError, match="does not send its ground truth"):
         ask_truth(tmp_path / "nowhere", [0.0], [])
+
+
+def test_the_surgeon_aims_in_another_way_where_aims_have_no_effect(tmp_path: Path) -> None:
+    room = Room(room_config(1, 320, aims=2, bump_every_s=float("inf")))
+    server = RoomServer(room, tmp_path / "socket")
+    server.stop()
+    server.run()  # ends at once, and releases the socket
+    first, seen = room.place, [room.place]
+    for step in range(400):
+        server._live(0.05 * step)
+        if room.place is not seen[-1]:
+            seen.append(room.place)
+    assert first.corner is not None
+    assert len(seen) >= 2
+    assert all(place.corner is not None for place in seen)  # still aims: none of the session's is used up
+    assert not np.allclose(seen[1].trus_T_marker, first.trus_T_marker)
+    assert room.proceed(20.0) is room._aims[1]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +23,7 @@ from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig, default_probe, default_rig
 from fgreg.simulation.pictures import LookPicture, ShotPicture
 from fgreg.simulation.render import Optics, UInt8Image
-from fgreg.simulation.scene import Scene, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
+from fgreg.simulation.scene import AimShots, Scene, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
 
 TRAVEL_MM_S, TRAVEL_RAD_S, LEAST_TRAVEL_S = 40.0, math.radians(30.0), 0.8
 """Mean speed of the fibre from place to place."""
@@ -178,6 +179,9 @@ class Room:
                     raise
             else:
                 break
+        return self._places_of(aims)
+
+    def _places_of(self, aims: AimShots) -> list[Place]:
         trus_T_camera = self.scene.trus_T_camera[0]
         return [
             Place(trus_T_camera @ pose, (int(corner[0]), int(corner[1])), trus_T_camera @ board)
@@ -202,13 +206,24 @@ class Room:
 
     def proceed(self, t_s: float) -> Place:
         """The surgeon goes on to the next place, from wherever the fibre is at ``t_s``."""
-        start = self._travels[-1].at(t_s)
-        self._place = self._next_place()
-        end = self._place.trus_T_marker
-        self._travels.append(Travel(t_s, t_s + travel_s(start, end), start, end))
+        self._go(self._next_place(), t_s)
         if self._place.corner is None and not math.isfinite(self._bump_due_s):
             self._bump_due_s = self._next_bump(t_s)
         return self._place
+
+    def go_elsewhere(self, t_s: float) -> Place:
+        """The surgeon aims in another way, since marker or board are not found in the pictures of this place."""
+        rng = np.random.default_rng((self.config.seed, 4, len(self._travels)))
+        config = replace(self.config.scene, aims=1)
+        with suppress(UnseenError):
+            (place,) = self._places_of(draw_aim_shots(config, self.scene, rng, rng.standard_normal((1, 3))))
+            self._go(place, t_s)
+        return self._place
+
+    def _go(self, place: Place, t_s: float) -> None:
+        start, end = self._travels[-1].at(t_s), place.trus_T_marker
+        self._place = place
+        self._travels.append(Travel(t_s, t_s + travel_s(start, end), start, end))
 
     def pass_to(self, t_s: float) -> None:
         """Advance the time and start the bumps that are due."""
