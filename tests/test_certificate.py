@@ -147,6 +147,23 @@ def test_no_bound_of_a_cell_is_above_the_cost_of_a_registration_in_it(case: str)
                 assert (np.einsum("bi,bi->b", off, np.linalg.solve(ellipsoid, off[..., None])[..., 0]) < 1.001).all()
 
 
+def test_parallel_beams_bound_neither_the_cost_nor_the_shift() -> None:
+    of = _conditional(_registered(5, pairs=8))
+    along = np.array([0.6, 0.0, 0.8])
+    rows = of.rows - np.einsum("min,i,k->mkn", of.rows, along, along)
+    of = replace(of, rows=rows)
+    for threshold in (0.5, 1e4):
+        first = first_intervals(of, threshold)
+        assert first is not None
+        assert first.low[1].min() > -1e-9  # no range is negative, whatever its noise
+        plain = lower_bounds(of, of.rotation[..., None], np.array([0.01]), first, threshold)
+        for found in (plain, sharper_bounds(of, of.rotation[..., None], np.array([0.01]), plain, threshold)):
+            assert found.possible.all()
+            assert found.cost[0] <= of.constant
+            assert np.sqrt(found.moved[3, 3, 0]) > 1e6
+    assert not replace(_certify(_registered(11, pairs=10)), within_mm=1e6).is_alone
+
+
 def test_bounds_of_small_cells_come_near_the_cost() -> None:
     of = _conditional(_registered(5, pairs=8))
     cost, reach = cost_at(of), np.radians([1.0, 0.5])

@@ -41,6 +41,10 @@ _NEWTON = 6
 """Steps for mu: any mu gives a bound."""
 SHARE = 0.15
 """Share of the quadratic's growth that pays for what the linearisation leaves, in the sharper bound."""
+_WEAKEST = 1e-6
+"""Of the information on the shift, its least part: below (beams parallel to 0.05 deg) rounding would make a bound."""
+_ANYWHERE_MM = 1e9
+_LEAST_RANGE_MM = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,8 +119,10 @@ def first_intervals(of: Conditional, threshold: float) -> Intervals | None:
     turned = within / np.sqrt(look.weight[2, 2])
     low = arc_of_rotation(np.maximum(look.rotation_rad - turned, -np.pi), look.heard_mm, of.radius_mm)
     high = arc_of_rotation(np.minimum(look.rotation_rad + turned, np.pi), look.heard_mm, of.radius_mm)
-    centre = np.stack([look.x_mm, look.heard_mm, 0.5 * (low + high)])
-    half = np.stack([within / np.sqrt(xr), within / np.sqrt(rr), 0.5 * (high - low)])
+    x_off, range_off = within / np.sqrt(xr), within / np.sqrt(rr)
+    nearest, farthest = np.maximum(look.heard_mm - range_off, 0.0), look.heard_mm + range_off  # ranges are not negative
+    centre = np.stack([look.x_mm, 0.5 * (nearest + farthest), 0.5 * (low + high)])
+    half = np.stack([x_off, 0.5 * (farthest - nearest), 0.5 * (high - low)])
     return Intervals(centre[..., None], half[..., None])
 
 
@@ -159,6 +165,7 @@ def sharper_bounds(of: Conditional, rotation: FloatArray, reach: FloatArray, kno
     """
     z, low, high = known.centre_fit, known.intervals.low, known.intervals.high
     z = np.clip(z, low, high)
+    z[1] = np.maximum(z[1], _LEAST_RANGE_MM)
     half = np.maximum(high - z, z - low)
     at = _linearised(of, rotation, z, half)
     line, looks = at.line, at.looks
@@ -306,7 +313,8 @@ def _minimum(hessian: FloatArray, pull: FloatArray, normal: FloatArray, reach: F
     spread = _inverse(hessian)
     gain = np.einsum("ijnb,jknb->iknb", spread, pull)
     n = normal - np.einsum("kinb,kjnb->ijb", pull, gain)
-    valid = _is_positive(hessian).all(axis=0) & _is_positive(n[3:6, 3:6])
+    weak = _WEAKEST * np.trace(n[3:6, 3:6]) * np.eye(3)[..., None]
+    valid = _is_positive(hessian).all(axis=0) & _is_positive(n[3:6, 3:6] - weak)
     n = np.where(valid, n, np.eye(7)[..., None])  # of those without a minimum nothing is used
     n = np.ascontiguousarray(n.transpose(2, 0, 1))
     inner, across = n[:, 3:6, 3:6], n[:, :, 3:6]
@@ -329,7 +337,7 @@ def _minimum(hessian: FloatArray, pull: FloatArray, normal: FloatArray, reach: F
     shift = -(inverse @ n[:, 3:6, 6:])[..., 0].T
     variance = np.einsum("iinb->inb", spread) + np.einsum("iknb,klb,ilnb->inb", gain[:, :6], covariance, gain[:, :6])
     return _Minimum(
-        least=least,
+        least=np.where(valid, least, 0.0),
         valid=valid,
         solution=solution,
         covariance=covariance,
@@ -362,7 +370,7 @@ def _narrowed(
         half=np.maximum(0.5 * (high - low), 1e-12),
         turn=found.solution[:3],
         shift=found.solution[3:],
-        moved=found.covariance * np.maximum(slack, 0.0),
+        moved=np.where(found.valid, found.covariance * np.maximum(slack, 0.0), _ANYWHERE_MM**2 * np.eye(6)[..., None]),
         centre_shift=found.fixed_shift,
         centre_fit=about.centre + found.fixed_step,
     )

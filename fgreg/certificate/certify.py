@@ -38,6 +38,8 @@ NEAR_RAD = np.radians(10.0)
 """Possible registrations farther than this from the estimate, and from each other, are worth a local search."""
 ABOUT_RAD = np.radians(30.0)
 """Registrations that may be turned by more than this are no longer about the estimate."""
+ABOUT_MM = 50.0
+"""Nor those that may be moved by more than this."""
 MOST_STARTS = 8
 FEW_CELLS = 500
 """Up to as many cells left by the search for others, the search for a better one starts from these."""
@@ -95,7 +97,8 @@ class Certificate:
     @property
     def is_alone(self) -> bool:
         """Whether all others within the threshold are proved to lie about it."""
-        return self.finished and self.regions == 1 and self.within_rad <= ABOUT_RAD
+        about = self.within_rad <= ABOUT_RAD and self.within_mm <= ABOUT_MM
+        return self.finished and self.regions == 1 and about
 
 
 def tolerance(cost: float) -> float:
