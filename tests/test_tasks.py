@@ -2,9 +2,12 @@
 
 import os
 import signal
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+import time
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from functools import partial
+from multiprocessing import active_children
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +16,7 @@ from fgreg.errors import InputError
 from fgreg.workers.tasks import run_tasks
 
 TASKS = list(range(12))
+NOT_THERE = ["remote", "dask", "dask:host", "dask:tcp://127.0.0.1:9", "slurm:partition", "local:x"]
 
 
 def square(task: int) -> int:
@@ -38,6 +42,34 @@ def refuses(task: int) -> int:
     return task
 
 
+def refuses_or_sleeps(task: int) -> int:
+    if task:
+        time.sleep(60.0)
+    return refuses(7 - task)
+
+
+class Shaky:
+    """Does one task in three; all others are lost."""
+
+    calls = 0
+
+    def submit(self, fn: Any, /, *args: Any) -> Future[Any]:
+        handle: Future[Any] = Future()
+        if self.calls % 3:
+            handle.set_exception(BrokenExecutor("a worker was killed"))
+        else:
+            handle.set_result(fn(*args))
+        self.calls += 1
+        return handle
+
+
+class Closed:
+    """Takes nothing."""
+
+    def submit(self, *_: Any) -> Future[Any]:
+        raise RuntimeError("sbatch: invalid partition")
+
+
 def test_a_killed_worker_costs_time_only(tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
     mark = tmp_path / "killed"
@@ -45,6 +77,25 @@ def test_a_killed_worker_costs_time_only(tmp_path: Path) -> None:
     assert list(found) == [square(task) for task in TASKS]
     assert mark.exists()
     assert seen[-1] == (12, 12)
+
+
+def test_workers_may_be_lost_often_where_others_get_on() -> None:
+    found = run_tasks(square, TASKS, jobs=3, executor=Shaky())
+    assert list(found) == [square(task) for task in TASKS]
+
+
+def test_an_executor_that_takes_no_tasks_is_a_broken_one() -> None:
+    with pytest.raises(BrokenExecutor, match="takes no tasks: sbatch: invalid partition"):
+        list(run_tasks(square, TASKS, executor=Closed()))
+
+
+def test_workers_at_work_end_with_the_run() -> None:
+    begun = time.monotonic()
+    with pytest.raises(InputError, match="found 7"):
+        list(run_tasks(refuses_or_sleeps, [0, 1], jobs=2))
+    for child in active_children():
+        child.join(20.0)
+    assert time.monotonic() - begun < 40.0
 
 
 def test_a_worker_lost_again_and_again_ends_the_run() -> None:
@@ -76,7 +127,7 @@ def test_the_same_by_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         assert list(run_tasks(square, TASKS[:2], executor=executor)) == [0, 1]
 
 
-@pytest.mark.parametrize("named", ["remote", "dask", "dask:tcp://127.0.0.1:9", "slurm:partition", "local:x"])
+@pytest.mark.parametrize("named", NOT_THERE)
 def test_an_executor_that_is_not_there_is_one_line(named: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fgreg.cli.executors.DASK_ANSWER_S", 0.2)
     with pytest.raises(InputError, match="--executor"), open_executor(named):

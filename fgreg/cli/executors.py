@@ -35,7 +35,7 @@ def open_executor(named: str, label: str = "--executor") -> Iterator[Executor | 
     try:
         if kind == "local" and not rest:
             yield None
-        elif kind == "dask" and rest:
+        elif kind == "dask" and rest.rpartition(":")[2].isdigit():  # else Dask fails, and hangs for 20 s at the end
             with _dask_client(rest, label) as client:
                 yield client.get_executor()
         elif kind == "slurm" or (kind == "submitit-local" and not rest):
@@ -43,7 +43,9 @@ def open_executor(named: str, label: str = "--executor") -> Iterator[Executor | 
         else:
             raise InputError(label, named, WANTED)
     except BrokenExecutor as error:
-        raise InputError(f"{label} {named}", str(error), "workers that have memory and time enough") from error
+        raise InputError(
+            f"{label} {named}", str(error), "workers that take tasks and have memory and time enough"
+        ) from error
 
 
 @contextmanager
@@ -54,7 +56,7 @@ def _dask_client(address: str, label: str) -> Iterator[Any]:
         raise MissingExtraError("distributed (Dask)", EXTRA) from error
     try:
         client: Any = Client(address, timeout=DASK_ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise InputError(label, f"no Dask scheduler at {address}", "the address of a running one") from error
     with client:
         yield client
@@ -74,7 +76,7 @@ def _submitit(kind: str, rest: str, label: str) -> Executor:
     try:
         made = submitit.AutoExecutor(LOGS, cluster="local" if kind == "submitit-local" else "slurm")
         made.update_parameters(**parameters)
-    except (RuntimeError, NameError, TypeError, AssertionError) as error:
+    except (RuntimeError, NameError, TypeError, AssertionError, OSError) as error:
         raise InputError(label, f"{kind}: {error}", "SLURM on this machine, and submitit's parameters") from error
     executor: Executor = made
     return executor

@@ -20,7 +20,7 @@ TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")
 POLL_S = 0.02
 TRIES = 3
-"""A part of the tasks whose worker was lost this often is the cause itself."""
+"""A part of the tasks whose worker was lost this often, with no other part done between, is the cause itself."""
 PARTS_PER_JOB = 4
 MOST_PER_PART = 8
 """Tasks sent to a worker at once, on this machine: few, so that progress is seen."""
@@ -61,8 +61,12 @@ class _LocalPool:
             return self._pool.submit(fn, *args)
 
     def close(self) -> None:
+        """End the workers, also those at work: no one waits for what they do."""
         if self._pool is not None:
+            workers = [*(self._pool._processes or {}).values()]  # later Pythons have `terminate_workers`
             self._pool.shutdown(wait=False, cancel_futures=True)
+            for worker in workers:
+                worker.terminate()
 
 
 def run_tasks(
@@ -83,7 +87,7 @@ def run_tasks(
         progress: called with (tasks done, all) as they are done, in any order.
 
     Raises:
-        BrokenExecutor: the worker of the same tasks was lost ``TRIES`` times.
+        BrokenExecutor: the worker of the same tasks was lost ``TRIES`` times, or the executor takes no tasks.
         Exception: what the function raised, with the worker's traceback as a note.
     """
     jobs = max(min(jobs, len(tasks)), 1)
@@ -103,7 +107,7 @@ def run_tasks(
     running: dict[int, Handle] = {}
     try:
         for index, part in enumerate(parts):
-            running[index] = where.submit(_run_part, function, part)
+            running[index] = _submitted(where, function, part)
         yield from _in_order(function, parts, running, where, progress)
     finally:
         for handle in running.values():
@@ -134,12 +138,13 @@ def _in_order(
                 lost[index] += 1
                 if lost[index] == TRIES:
                     raise BrokenExecutor(f"a worker was lost {TRIES} times at the same tasks: {loss}") from loss
-                running[index] = where.submit(_run_part, function, parts[index])
+                running[index] = _submitted(where, function, parts[index])
                 continue
             if error is not None:
                 raise error
             ready[index] = found
             done += len(found)
+            lost = [0] * len(parts)  # a pool that loses one worker loses the tasks of all others, too
             if progress is not None:
                 progress(done, total)
         if following in ready:
@@ -147,6 +152,13 @@ def _in_order(
             following += 1
         else:
             time.sleep(POLL_S)
+
+
+def _submitted(where: Executor, function: Callable[[TaskT], ResultT], part: Sequence[TaskT]) -> Handle:
+    try:
+        return where.submit(_run_part, function, part)
+    except Exception as error:  # each executor has its own: a scheduler that is gone, a queue that SLURM does not have
+        raise BrokenExecutor(f"it takes no tasks: {str(error) or type(error).__name__}") from error
 
 
 def _run_part(
