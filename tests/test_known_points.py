@@ -11,7 +11,8 @@ import pytest
 
 import fgreg
 from fgreg.model.estimate import SessionEstimate, Verdict
-from fgreg.model.measurements import Check
+from fgreg.model.measurements import Check, VisibleSpot
+from fgreg.model.plausible import implausible_measurements
 from fgreg.pipeline.replay import ReplayRequest, replay_session
 from fgreg.session.result_file import read_result
 from fgreg.simulation.config import SimulationConfig
@@ -105,3 +106,22 @@ def test_epochs_take_their_points_with_them() -> None:
         assert epoch.covariance is not None
         off = np.linalg.norm(epoch.trus_T_camera[:3, 3] - true[:3, 3])
         assert off < 4.0 * np.sqrt(np.trace(epoch.covariance[3:, 3:])) + 0.5
+
+
+def test_points_and_spots_in_another_unit_or_behind_the_camera_are_seen() -> None:
+    _, measurements, _ = make_measurements(np.random.default_rng(1), pairs=2, points=2, spot_sigma_mm=(0.3, 0.3, 1.0))
+    assert not implausible_measurements(measurements)
+    points = [
+        replace(point, camera_p_mm=point.camera_p_mm / 1000.0, trus_p_mm=point.trus_p_mm / 1000.0)
+        for point in measurements.points
+    ]
+    pairs = [
+        replace(pair, spot=VisibleSpot(-pair.spot.camera_p_mm, np.eye(3))) for pair in measurements.pairs if pair.spot
+    ]
+    doubts = implausible_measurements(replace(measurements, pairs=tuple(pairs), points=tuple(points)))
+    assert [text.partition(":")[0] for text in doubts] == [
+        "2 of 2 visible spots lie behind the camera",
+        "median of point.camera_p_mm",
+        "median of point.trus_p_mm",
+    ]
+    assert all("in metres it would be" in text for text in doubts[1:])

@@ -74,3 +74,11 @@ def test_pixels_need_two_cameras(tmp_path: Path) -> None:
     pair["spot"] = {"left": [10.0, 20.0], "right": [8.0, 20.0]}
     with pytest.raises(InputError, match=r"spot\.left: found pixels, but no camera with camera\.right"):
         read_session(session_files.write(tmp_path, setup, [pair]))
+
+
+def test_pixels_are_of_a_picture(tmp_path: Path) -> None:
+    setup, pair = session_files.setup(), session_files.events()[3]
+    width = setup["camera"]["image_size"][0]
+    pair["spot"] = {"left": [10.0, 20.0], "right": [width, 20.0]}
+    with pytest.raises(InputError, match=r"spot\.right: found .*, expected a pixel of a picture of"):
+        read_session(session_files.write(tmp_path, setup, [pair]))

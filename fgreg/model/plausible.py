@@ -82,6 +82,7 @@ SQUARE = _mm(0.5, 100.0, "a square of a board")
 TARGET = _mm(5.0, 300.0, "the distance of the targets from the probe's axis")
 DISTANCE = _mm(5.0, 1500.0, "the distance from the camera")
 RANGE = _mm(2.0, 250.0, "the range of a PM")
+FROM_AXIS = _mm(3.0, 300.0, "the distance of a point from the probe's axis")
 NOISE_LENGTH = _mm(0.0, 20.0, "a standard deviation")
 NOISE_ANGLE = Plausible(0.0, 10.0, "deg", "a standard deviation")
 NOISE_RADIANS = Plausible(0.0, 0.3, "rad", "a standard deviation", (("degrees", math.radians(1.0)),))
@@ -223,12 +224,21 @@ def _of_rig(model: SessionModel) -> Iterator[str]:
 
 
 def implausible_measurements(measurements: Measurements) -> tuple[str, ...]:
-    """Doubts about the unit of poses, spots and ranges, by their medians."""
+    """Doubts about the unit of poses, spots, ranges and known points, by their medians."""
     shots: tuple[Aim | Pair, ...] = (*measurements.aims, *measurements.pairs)
-    return implausible_distances(
-        [shot.marker.camera_T_marker for shot in shots],
-        [aim.camera_p_spot_mm for aim in measurements.aims],
-        [pair.look.range_mm for pair in measurements.pairs],
+    seen = [pair.spot.camera_p_mm for pair in measurements.pairs if pair.spot is not None]
+    points, shown = ([getattr(point, name) for point in measurements.points] for name in ("camera_p_mm", "trus_p_mm"))
+    return (
+        *implausible_distances(
+            [shot.marker.camera_T_marker for shot in shots],
+            [aim.camera_p_spot_mm for aim in measurements.aims],
+            [pair.look.range_mm for pair in measurements.pairs],
+        ),
+        *_behind("visible spots", [float(point[2]) for point in seen]),
+        *_behind("known points", [float(point[2]) for point in points]),
+        *_median(DISTANCE, "spot.camera_p_mm", (float(np.linalg.norm(point)) for point in seen)),
+        *_median(DISTANCE, "point.camera_p_mm", (float(np.linalg.norm(point)) for point in points)),
+        *_median(FROM_AXIS, "point.trus_p_mm", (float(np.linalg.norm(point[1:])) for point in shown)),
     )
 
 

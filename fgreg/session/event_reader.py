@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from fgreg.errors import InputError, one_line
+from fgreg.model.camera_model import StereoRig
 from fgreg.model.events import (
     EVENTS,
     AimEvent,
@@ -20,6 +21,7 @@ from fgreg.model.events import (
     PairEvent,
     PointEvent,
     RefusedEvent,
+    SpotRecord,
     TrackEvent,
     TrusRecord,
 )
@@ -212,6 +214,8 @@ def _misfits(event: Event, setup: Setup | None, seen: ShotsSeen) -> Iterator[Pro
     if point is not None and point.left is not None and not {"camera", "camera.right"} <= setup.present:
         found = "pixels, but no camera with camera.right in session.yaml"
         yield Problem(("left",) if spot is None else ("spot", "left"), found, "them there, or camera_p_mm")
+    elif point is not None and setup.camera is not None:
+        yield from _outside(point, () if spot is None else ("spot",), setup.camera)
     if corner is not None:
         board = setup.board
         if "board" not in setup.present:
@@ -219,6 +223,19 @@ def _misfits(event: Event, setup: Setup | None, seen: ShotsSeen) -> Iterator[Pro
         elif board is not None and not (corner[0] < board.columns and corner[1] < board.rows):
             expected = f"[column, row] of a board with {board.columns} columns and {board.rows} rows, counted from 0"
             yield Problem(("corner",), shown(list(corner)), expected)
+
+
+def _outside(
+    point: CheckEvent | PointEvent | SpotRecord, path: tuple[str | int, ...], rig: StereoRig
+) -> Iterator[Problem]:
+    """Pixels that are in no picture; (0, 0) is the middle of the first one."""
+    for name, pixel, camera in (("left", point.left, rig.left), ("right", point.right, rig.right)):
+        if pixel is None or camera is None:
+            continue
+        width, height = camera.image_size
+        if not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
+            found = f"({pixel[0]:g}, {pixel[1]:g})"
+            yield Problem((*path, name), found, f"a pixel of a picture of {width} x {height} px")
 
 
 def _lacks_camera(marker: MarkerRecord, path: tuple[str | int, ...], setup: Setup) -> Iterator[Problem]:
