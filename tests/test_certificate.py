@@ -161,6 +161,10 @@ def test_parallel_beams_bound_neither_the_cost_nor_the_shift() -> None:
             assert found.possible.all()
             assert found.cost[0] <= of.constant
             assert np.sqrt(found.moved[3, 3, 0]) > 1e6
+        unknown = replace(of, offset=np.full_like(of.offset, np.nan))
+        found = lower_bounds(unknown, of.rotation[..., None], np.array([0.01]), first, threshold)
+        assert found.possible.all()
+        assert found.cost[0] == 0.0
     assert not replace(_certify(_registered(11, pairs=10)), within_mm=1e6).is_alone
 
 

@@ -361,8 +361,10 @@ def _narrowed(
     far = np.sqrt(np.maximum(slack, 0.0) * np.maximum(found.variance, 0.0)) * (1.0 + _SAFE)
     far = np.where(found.valid, far, np.inf)
     middle = about.centre + np.where(found.valid, found.step, 0.0)
-    low, high = np.maximum(before.low, middle - far), np.minimum(before.high, middle + far)
-    possible = (cost <= threshold) & (~found.valid | (slack > 0.0)) & (low <= high).all(axis=(0, 1))
+    # What is not a number excludes nothing.
+    low, high = np.fmax(before.low, middle - far), np.fmin(before.high, middle + far)
+    cost = np.where(np.isnan(cost), 0.0, cost)
+    possible = (cost <= threshold) & ~(found.valid & (slack <= 0.0)) & ~(low > high).any(axis=(0, 1))
     return Bounds(
         cost=cost,
         possible=possible,

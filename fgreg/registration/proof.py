@@ -175,7 +175,7 @@ def proof_of(found: Certificate, others: Sequence[Other], pms: int, cost: float)
     text = (
         f"no other registration explains these pairs within {within:.1f} of its chi square, proved: all that do are "
         f"turned by at most {degrees:.1f} deg from it and move the middle of the pairs by at most {mm:.1f} mm (beam "
-        "and the rig's constants as estimated)"
+        "and the rig's constants, windows and inliers as estimated)"
     )
     return Proof(estimate, (Condition(Verdict.OK, text),))
 
