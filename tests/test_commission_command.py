@@ -35,7 +35,7 @@ def root(written: Path, tmp_path: Path) -> Path:
 
 
 def commission(*words: object) -> Result:
-    return RUNNER.invoke(app, ["commission", *map(str, words)])
+    return RUNNER.invoke(app, ["commission", "--jobs", "1", *map(str, words)])
 
 
 def changed(folder: Path, *path: str, to: object) -> None:

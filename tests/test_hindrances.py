@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fgreg.model.events import NoteEvent
-from fgreg.online.hindrances import hindrances
+from fgreg.model.hindrances import hindrances
 from fgreg.pipeline.solve import SolveRequest, solve_session
 from tests.session_files import events, setup, write, write_frames
 

@@ -30,10 +30,10 @@ from fgreg.live.simulated_room import room_setup
 from fgreg.live.stage_commands import AGAIN_RAD, AGAIN_S
 from fgreg.model.estimate import Verdict
 from fgreg.model.events import NoteEvent, StageEvent
+from fgreg.model.hindrances import TOO_SLOW
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved
-from fgreg.online.hindrances import TOO_SLOW
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.room import Room, room_config
 from tests.rehearsal import Rehearsal

@@ -11,7 +11,7 @@ from collections import deque
 
 import numpy as np
 
-from fgreg.online.hindrances import MACHINE, TOO_FEW, TOO_SLOW
+from fgreg.model.hindrances import MACHINE, TOO_FEW, TOO_SLOW
 
 MEASURE_S, OVER_S = 3.0, 5.0
 """Time from the first processed frame until the first message; what is measured later is over the last ``OVER_S``."""

@@ -32,11 +32,11 @@ from fgreg.model.estimate import (
     Verdict,
 )
 from fgreg.model.events import AimEvent, CheckEvent, Event, PairEvent, PointEvent, TrackEvent, looks_of
+from fgreg.model.hindrances import with_hindrances
 from fgreg.model.lens import project
 from fgreg.model.measurements import Check, Look, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online.hindrances import with_hindrances
 from fgreg.output.atomic_file import check_outputs
 from fgreg.pipeline.exclude import ShotNames, without_shots
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks

@@ -261,6 +261,8 @@ def _check_source(tried: _Tried) -> None:
         losses = tried.losses[before:]
         _rule(len(losses) <= number + 1, f"more losses than wrong data up to bad[{number}]: {losses}")
     tried.run(QUIET_S, lambda: False)
+    if bench.bad:  # a loss by the last of it is over
+        tried.until_items(1, "no data after wrong data")
     if bench.restore is not None:  # else it may have ended by now
         tried.losses.clear()
     bench.lose()
