@@ -47,7 +47,8 @@ class VideoSource(Kind):
             return str(value)
         if not isinstance(value, str) or not value:
             raise FieldError.of(shown(value), self.expected)
-        if value.isdecimal() or _VIDEO_DEVICE.fullmatch(value) or _STREAM.fullmatch(value):
+        number = value.isdecimal() and len(value) <= 3  # YAML's reader gives a huge integer as text
+        if number or _VIDEO_DEVICE.fullmatch(value) or _STREAM.fullmatch(value):
             return value
         path = (folder or Path()) / value
         if not (exists(path) or ("*" in path.name and _matches(path))):

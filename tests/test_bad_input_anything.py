@@ -24,7 +24,7 @@ from tests import session_files
 
 Read = TypeVar("Read")
 
-QUICK = settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+QUICK = settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 
 NUMBERS = st.one_of(
     st.integers(),
@@ -228,7 +228,7 @@ PLAIN = st.recursive(
 )
 
 
-@settings(QUICK, max_examples=60)
+@settings(QUICK, max_examples=40)
 @given(data=st.dictionaries(st.text("abc-", min_size=1), PLAIN, min_size=1, max_size=4))
 def test_data_that_another_writer_wrote_reads_as_the_same(data: dict[str, Any]) -> None:
     def same(read: Any, written: Any) -> bool:

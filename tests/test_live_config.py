@@ -65,6 +65,7 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("camera.driver", ["endoscope"], "camera.driver (line 4)", "['endoscope']", "one of endoscope"),
     ("camera.left", ABSENT, "camera.left", "nothing", "a video device"),
     ("camera.left", -1, "camera.left (line 5)", "-1", "a video device"),
+    ("camera.left", 10**30, "camera.left (line 5)", "'1000", "a video device"),
     ("camera.left", True, "camera.left (line 5)", "true", "a video device"),
     ("camera.left", "left.mp4", "camera.left (line 5)", "'left.mp4'", "relative to this file's folder"),
     ("camera.left", "left/*.png", "camera.left (line 5)", "'left/*.png'", "a folder of pictures"),
