@@ -112,7 +112,7 @@ class FullSolveResult:
         begins: place of the pair with which the current epoch begins, where it is another one; likewise.
         initial: the registration; None where there is none, for the reason ``why_none``, or none was wanted.
         report: None where none was wanted, or the case has to be solved again.
-        draft: minima of the current epoch, where the case has to be solved again with ``finished`` linearised anew.
+        draft: minima of the current epoch, where the case has to be solved again with ``finished`` linearised again.
         move_failure: why the camera-move test failed, empty where it did not; None where no test was wanted.
     """
 

@@ -327,8 +327,11 @@ class ActiveWindow:
     covariance: FloatArray
 
 
-def empty_isam(columns: Columns) -> gtsam.ISAM2:
-    """iSAM2 that eliminates by QR (see fgreg.graph.gtsam_values.newton_step); re-linearises by the thresholds above."""
+def empty_isam(columns: Columns, *, spots: bool = False) -> gtsam.ISAM2:
+    """iSAM2 that eliminates by QR (see fgreg.graph.gtsam_values.newton_step); re-linearises by the thresholds above.
+
+    ``spots``: the spots of aims are variables too, with the thresholds of PMs.
+    """
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.relinearizeSkip = 1
@@ -337,6 +340,8 @@ def empty_isam(columns: Columns) -> gtsam.ISAM2:
     thresholds = gtsam.ISAM2ThresholdMap()
     for variable, steps in THRESHOLDS.items():
         thresholds.insert((variable.value, np.array(steps)))
+    if spots:
+        thresholds.insert((Variable.camera_p_spot.value, np.array(THRESHOLDS[Variable.trus_p_pm])))
     rig_steps = [RIG_STEPS[TEXTS[constant].unit] for constant in columns.constants]
     thresholds.insert((Variable.rig.value, np.array(rig_steps)))
     parameters.setRelinearizeThreshold(thresholds)

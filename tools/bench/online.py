@@ -15,8 +15,8 @@ import numpy as np
 
 from bench.compare import Row, Section, Target, say
 from bench.contenders import linear_rows
-from fgreg.graph.columns import Columns, make_columns
-from fgreg.graph.gtsam_graph import GraphOptions, Variable, build_graph
+from fgreg.graph.columns import make_columns
+from fgreg.graph.gtsam_graph import GraphOptions, build_graph
 from fgreg.graph.gtsam_values import SharedValues
 from fgreg.graph.packing import least_sigmas, pack
 from fgreg.graph.reduced_solver import optimize
@@ -27,7 +27,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.full_solve import FullSolveCase
 from fgreg.online.solver import InProcessSolver
-from fgreg.smoother.isam_window import RIG_STEPS, THRESHOLDS, empty_isam
+from fgreg.smoother.isam_window import empty_isam
 from fgreg.smoother.updates import LEAVE, MOST
 from graph_optimum import initial_values, read_shared
 from graph_optimum import optimize as optimize_graph
@@ -104,22 +104,6 @@ class RebuiltExplicit:
         return time.process_time() - start
 
 
-def _isam_with_spots(columns: Columns) -> gtsam.ISAM2:
-    """As :func:`fgreg.smoother.isam_window.empty_isam`, with the spots of aims as variables."""
-    parameters = gtsam.ISAM2Params()
-    parameters.setFactorization("QR")
-    parameters.relinearizeSkip = 1
-    parameters.findUnusedFactorSlots = True
-    parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
-    thresholds = gtsam.ISAM2ThresholdMap()
-    for variable, steps in THRESHOLDS.items():
-        thresholds.insert((variable.value, np.array(steps)))
-    thresholds.insert((Variable.camera_p_spot.value, np.array(THRESHOLDS[Variable.trus_p_pm])))
-    thresholds.insert((Variable.rig.value, np.full(len(columns.constants), RIG_STEPS["deg"])))
-    parameters.setRelinearizeThreshold(thresholds)
-    return gtsam.ISAM2(parameters)
-
-
 class IsamAll:
     """iSAM2 with custom factors, every pair kept."""
 
@@ -127,7 +111,7 @@ class IsamAll:
         options = GraphOptions(marker_T_nominal=truth.marker_T_laser)
         self._explicit = build_graph(measurements, model, options)
         self._values = initial_values(self._explicit, SharedValues(truth.trus_T_camera, np.zeros(4)))
-        self._isam = _isam_with_spots(make_columns(1, least_sigmas(model.constant_sigmas)))
+        self._isam = empty_isam(make_columns(1, least_sigmas(model.constant_sigmas)), spots=True)
         keys, count = self._explicit.keys, len(measurements.pairs)
         self._looks = self._explicit.graph.size() - 2 * count
         self._shots = self._looks - 2 * count
