@@ -1,7 +1,7 @@
 """Options and executor of the studies: ``--jobs`` and ``--executor``, as `fgreg evaluate` has them.
 
-On a cluster the workers need the same Python environment, and this folder in PYTHONPATH. The numbers are those of one
-process: each task has its own seed, and results come in the order of the tasks.
+On a cluster the workers need the same Python environment; those of Dask also this folder in PYTHONPATH. The numbers
+are those of one process: each task has its own seed, and results come in the order of the tasks.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
@@ -39,13 +41,28 @@ def open_executor(named: str, label: str = "--executor") -> Iterator[Executor | 
             with _dask_client(rest, label) as client:
                 yield client.get_executor()
         elif kind == "slurm" or (kind == "submitit-local" and not rest):
-            yield _submitit(kind, rest, label)
+            with _search_path_for_workers():
+                yield _submitit(kind, rest, label)
         else:
             raise InputError(label, named, WANTED)
     except BrokenExecutor as error:
         raise InputError(
             f"{label} {named}", str(error), "workers that take tasks and have memory and time enough"
         ) from error
+
+
+@contextmanager
+def _search_path_for_workers() -> Iterator[None]:
+    """Let processes started from here import what this program imports, as those of ``multiprocessing`` do."""
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(os.fspath(Path(folder).resolve()) for folder in sys.path)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
 
 
 @contextmanager
