@@ -140,6 +140,16 @@ def test_one_outlier_look_of_several_is_rejected_alone() -> None:
     np.testing.assert_array_equal(here, other)
 
 
+def test_a_look_that_would_fit_alone_does_not_count_as_a_pm_of_its_own() -> None:
+    model, clean, _ = make_measurements(np.random.default_rng(2), pairs=10, looks_per_pm=4, share_marker=True)
+    pairs, sigma = list(clean.pairs), float(np.sqrt(clean.pairs[13].look.covariance[1, 1]))
+    look = pairs[13].look  # a spot farther along the same beam, as of a hand that trembles
+    pairs[13] = replace(pairs[13], look=replace(look, range_mm=look.range_mm + 9.0 * sigma))
+    solution = solve(replace(clean, pairs=tuple(pairs)), [], model, SolveConfig())
+    assert [i for i, pair in enumerate(solution.pairs) if not pair.used] == [13]
+    assert not [reason for reason in solution.reasons if "marker observations serve" in reason]
+
+
 def test_outliers_in_one_epoch_do_not_affect_the_other() -> None:
     model, spoiled, _, _ = _spoiled(2, false_pms=(1, 4), pairs=24, epochs=2)
     solution = solve(spoiled, [], model, SolveConfig())

@@ -178,7 +178,7 @@ def solve_jointly(
         start = robust.state
         first = _enough(whole, robust.pm_inlier[0], robust.aim_inlier[0])
     selection = select_inliers(whole, start, *first)
-    kept = _enough(whole, selection.pm_inlier, selection.aim_inlier)
+    kept, given = _enough(whole, selection.pm_inlier, selection.aim_inlier), set(whole.pms)
     for _ in range(READINGS):
         other = _other_readings(measurements, whole, kept, selection, packed)
         if other is None:
@@ -187,6 +187,8 @@ def solve_jointly(
         whole = packed(measurements)
         selection = select_inliers(whole, selection.state, pm_inlier, kept[1])
         kept = _enough(whole, selection.pm_inlier, selection.aim_inlier)
+        # Alone a look fits easily; what was split off shares its PM's marker observation, so it is no shot of its own.
+        kept = kept[0] & np.isin(whole.pms, list(given)), kept[1]
     chosen = only_inliers(measurements, whole.pms, *kept)
     problem = packed(chosen)
     # Pictures and wavefronts of shots that are left out say nothing of the constants.
