@@ -19,7 +19,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.events import events_in_order
 from fgreg.registration.register import register
-from fgreg.registration.solve import distance_to_explicit
+from fgreg.registration.solve import distance_to_explicit, solve
 from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera
 from tests.online_streams import batch, events, first, restored, sigmas_apart
 
@@ -132,3 +132,36 @@ def test_a_motion_from_an_ambiguous_epoch_leads_to_an_ambiguous_one_until_its_ow
     restored(again, replace(measurements, pairs=pairs[:4]))
     assert again.state.is_open
     assert again.estimate.verdict is Verdict.REFUSED
+
+
+def _bumped_after(counts: tuple[int, ...], *, known_motion: bool) -> tuple[SessionModel, Measurements]:
+    """Epochs of the first PMs of a session each, with measured motions between them or none."""
+    model, whole, _ = make_measurements(
+        np.random.default_rng(8), pairs=12 * len(counts), epochs=len(counts), known_motion=known_motion, looks_per_pm=4
+    )
+    kept: list[Pair] = []
+    for epoch, count in enumerate(counts):
+        names = list(dict.fromkeys(pair.pm for pair in whole.pairs if pair.epoch == epoch))[:count]
+        kept += [pair for pair in whole.pairs if pair.pm in names]
+    return model, replace(whole, pairs=tuple(kept))
+
+
+def test_epochs_tied_by_measured_motions_need_spread_spots_between_them_not_each() -> None:
+    lines = "on one line", "parallel"
+    for known in (True, False):
+        model, measurements = _bumped_after((8, 2, 8), known_motion=known)
+        solution = solve(measurements, (), model, CONFIG)
+        missed = [reason for reason in solution.reasons if any(text in reason for text in lines)]
+        assert bool(missed) is not known or solution.epochs[1].verdict is Verdict.REFUSED
+        if known:
+            assert not missed
+
+
+def test_what_an_earlier_epoch_lacks_is_no_reason_against_the_current_one() -> None:
+    model, measurements = _bumped_after((2, 12), known_motion=True)
+    engine = restored(OnlineRegistration(model, find_moves=False), measurements)
+    estimate = engine.settle()
+    assert estimate.epoch == 1
+    assert not [reason for reason in estimate.reasons if "epoch 0" in reason]
+    whole = solve(engine.measurements(), (), model, CONFIG)
+    assert estimate.verdict is whole.epochs[1].verdict

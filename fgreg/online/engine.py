@@ -559,7 +559,9 @@ class OnlineRegistration:
         report = self._report if self._report is not None and self._report.epoch == state.epoch else None
         settled = report is not None and report.serial == self._serial and state is self._state
         estimate = reported(state, t, report, self._model, self._config, settled=settled)
-        known = [self._noticed.get(state.epoch, "")]
+        # A move whose motion was measured, by static tags or by the holder, is as sure as a reported one.
+        measured = state.now.start.motion_known and state.now.start.after is None
+        known = ["" if measured else self._noticed.get(state.epoch, "")]
         if self._solver.failure:
             known.append(f"the full solve failed: {self._solver.failure}: its earlier result may be out of date")
         if self._move_failure:

@@ -27,6 +27,7 @@ from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.posterior import pose_tangent
 from fgreg.registration.register import Registration, register
 from fgreg.registration.solve import EpochReport, Solution, solve
+from fgreg.registration.verdict import worst_first
 from fgreg.smoother.initialise import Initial, initial_of
 from fgreg.smoother.marginal_prior import has_moved
 
@@ -68,7 +69,7 @@ class Report:
 
     Attributes:
         serial: of the case. epoch: the current one then. pairs: inlier looks.
-        verdict, reasons: of the solve.
+        verdict, reasons: of this epoch, and of what all epochs share.
         trus_T_camera, covariance, predicted_tre: as the solve reports them; None where it has no registration.
         shift: (6,) from the optimum to the reported registration, in units of the optimum's Gaussian (its Cholesky
             factor). root, optimum_root: (6, 6) Cholesky factors of the reported covariance and of the optimum's.
@@ -248,8 +249,9 @@ def _report(solution: Solution, case: FullSolveCase) -> Report:
         case.serial,
         epoch,
         data.pairs,
-        max(data.verdict, solution.verdict, key=lambda v: v.severity),
-        solution.reasons,
+        data.verdict,
+        # What an earlier epoch lacks can no longer be mended, and is not of this registration.
+        worst_first((c, c.text) for c in solution.reports[epoch].conditions) if solution.reports else solution.reasons,
         pose,
         covariance,
         data.predicted_tre,

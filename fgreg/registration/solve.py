@@ -12,6 +12,7 @@ from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.gtsam_graph import GraphOptions, Rig, build_graph
 from fgreg.graph.gtsam_values import PrivateValues, SharedValues, newton_step, values_at
+from fgreg.graph.packing import EpochLink
 from fgreg.graph.reduced_blocks import moved_markers
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.estimate import (
@@ -404,12 +405,29 @@ def _epoch_conditions(
     found.extend(hypotheses(search, config))
     found.extend(_outlier_conditions(registration, place))
     if mine:
-        directions = _directions_in_trus(np.stack([p.marker.camera_T_marker for p in mine]), state, place)
-        points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.used and e.trus_p_pm_mm is not None])
-        if not linked or len(mine) >= config.min_pairs:
-            found.extend(spread(directions, points, config))
-        found.extend(sweeps(mine, config))
+        tied = _tied_epochs(problem.links, place)
+        shared = [pair for pair in registration.measurements.pairs if pair.epoch in tied]
+        directions = np.concatenate(
+            [
+                _directions_in_trus(np.stack([p.marker.camera_T_marker for p in shared if p.epoch == at]), state, at)
+                for at in sorted({pair.epoch for pair in shared})
+            ]
+        )
+        of_session = {registration.epochs[at] for at in tied}
+        points = [e.trus_p_pm_mm for e in pairs if e.epoch in of_session and e.used and e.trus_p_pm_mm is not None]
+        if not linked or len({(pair.epoch, pair.pm) for pair in shared}) >= config.min_pairs:
+            found.extend(spread(directions, np.stack(points), config))
+        found.extend(sweeps(shared, config))
     return found
+
+
+def _tied_epochs(links: Sequence[EpochLink], place: int) -> set[int]:
+    """An epoch and those tied to it by measured motions: their pairs have one registration between them."""
+    tied, before = {place}, 0
+    while len(tied) > before:
+        before = len(tied)
+        tied |= {end for link in links if {link.old, link.new} & tied for end in (link.old, link.new)}
+    return tied
 
 
 def _steadiness(registration: Registration, place: int, limit_mm: float) -> list[Condition]:
