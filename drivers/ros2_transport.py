@@ -129,6 +129,7 @@ class ZenohTransport:
             ("scouting/gossip/enabled", "false"),
             ("scouting/delay", "0"),
             ("timestamping/enabled", "true"),  # as a cache of messages needs it
+            ("transport/shared_memory/enabled", "false"),  # a process that is killed would leave its blocks behind
         ):
             config.insert_json5(key, value)
         self._domain, self._hash_of = domain, hash_of

@@ -62,6 +62,7 @@ class Peer:
         config.insert_json5("listen/endpoints", f'["{self.router}"]')
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("scouting/delay", "0")
+        config.insert_json5("transport/shared_memory/enabled", "false")
         self.session = zenoh.open(config)
         self._loop = asyncio.new_event_loop()  # pyzeros asks for one; nothing runs in it
         asyncio.set_event_loop(self._loop)

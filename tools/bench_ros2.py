@@ -37,6 +37,7 @@ def send(port: int, seconds: float, rate: float, width: int, height: int) -> Non
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
     config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("transport/shared_memory/enabled", "false")
     session: Any = zenoh.open(config)
     random = np.random.default_rng(1)
     coarse = random.integers(0, 255, (height // 8, width // 8, 3), np.uint8)
