@@ -1,16 +1,24 @@
-"""A session in a simulated room in simulated time: no processes, no pictures, observations with known noise."""
+"""A session in a simulated room in simulated time: no processes, no pictures, observations with known noise.
+
+The static tags of the room, if it has any, are seen by their corners and poses with noise of their own.
+"""
 
 from __future__ import annotations
 
 import math
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from fgreg.drivers.base import CommandKind, OperatorCommand
+from fgreg.detection.marker import ViewCorners
+from fgreg.detection.marker_roi import EVERYWHERE
+from fgreg.detection.tags import FoundTag
+from fgreg.drivers.base import CommandKind, OperatorCommand, StereoFrame
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.errors import InputError
-from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, make_transform
 from fgreg.live.actions import (
     Action,
     Ask,
@@ -28,13 +36,16 @@ from fgreg.live.actions import (
     TakePairs,
     Tell,
 )
+from fgreg.live.marker_tracker import WholeFrame
 from fgreg.live.merge_looks import one_spot
+from fgreg.live.static_tags import StaticTags
 from fgreg.live.workflow import Workflow, WorkflowSettings
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.model.time_sync import PairRefused, PoseHistory, TimedPose
+from fgreg.model.time_sync import PairRefused, PoseHistory, Stamp, TimedPose
 from fgreg.online.engine import OnlineRegistration
+from fgreg.online.events import CameraMoved
 from fgreg.session.setup_reader import read_setup
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room
@@ -43,6 +54,59 @@ from fgreg.stage.limits import MotionKind
 SIGMA_RAD, SIGMA_MM = 0.003, np.array([0.05, 0.05, 0.2])
 PULSE_S = 0.1
 TRACK_SIGMA_RAD = math.radians(2.0)
+TAG_SIGMA_RAD, TAG_SIGMA_MM, CORNER_PX = 0.0005, 0.03, 0.3
+
+
+class SeenTags:
+    """Static tags of a room as its camera sees them, in place of the pictures and of the process that fits poses."""
+
+    busy = False
+
+    def __init__(self, room: Room, rng: np.random.Generator) -> None:
+        self._room, self._rng, self._now_s = room, rng, 0.0
+
+    def whole(self, now_s: float) -> WholeFrame:
+        """A frame searched as a whole: the corners (px) of the tags that are in the picture."""
+        self._now_s = now_s
+        rig = self._room.config.scene.camera
+        sides = [(rig.left, np.eye(4))]
+        if rig.right is not None and rig.right_T_left is not None:
+            sides.append((rig.right, rig.right_T_left))
+        views = []
+        for camera, view_T_camera in sides:
+            found = []
+            for tag in self._room.config.scene.static_tags:
+                half = 0.5 * tag.size_mm
+                square = np.array([[-half, half], [half, half], [half, -half], [-half, -half]])
+                pose = view_T_camera @ self._poses()[tag.id]
+                points = np.column_stack([square, np.zeros(4)]) @ pose[:3, :3].T + pose[:3, 3]
+                pixels = points @ camera.matrix.T
+                corners = pixels[:, :2] / pixels[:, 2:] + CORNER_PX * self._rng.standard_normal((4, 2))
+                if np.all(points[:, 2] > 0) and np.all((corners > 0) & (corners < camera.image_size)):
+                    found.append(FoundTag(tag.id, corners))
+            views.append(ViewCorners(None, (), (), np.zeros((0, 2)), tuple(found)))
+        picture = np.zeros((2, 2), np.uint8)
+        frame = StereoFrame(Stamp(now_s, now_s), picture, picture if len(views) > 1 else None, 0)
+        return WholeFrame(now_s, frame, views[0], views[1] if len(views) > 1 else None)
+
+    def _poses(self) -> dict[int, FloatArray]:
+        camera_T_trus = inverse(self._room.trus_T_camera(self._now_s))
+        return {tag: np.asarray(camera_T_trus @ pose) for tag, pose in self._room.trus_T_tags(self._now_s).items()}
+
+    def run(self, _work: object, view: Any) -> Future[Any]:
+        """Poses with noise, and its covariance, of the tags in the frame."""
+        seen = set.intersection(*({tag.id for tag in tags} for _, tags in view.views))
+        sigma = np.array([TAG_SIGMA_RAD] * 3 + [TAG_SIGMA_MM] * 3)
+        done: Future[Any] = Future()
+        noise = {tag: sigma * self._rng.standard_normal(6) for tag in seen}
+        done.set_result(
+            {
+                tag: (pose @ make_transform(exp_so3(noise[tag][:3]), noise[tag][3:]), np.diag(sigma**2))
+                for tag, pose in self._poses().items()
+                if tag in seen
+            }
+        )
+        return done
 
 
 @dataclass(eq=False)
@@ -87,7 +151,9 @@ class Rehearsal:
         self._rng = np.random.default_rng(self.room.config.seed)
         self._said: list[OperatorCommand] = []
         self._aimed_s, self._next_pulse, self._number, self._aims = -math.inf, 0.0, 0, 0
-        self._noted_s = -math.inf
+        self._noted_s, self._frames = -math.inf, 0
+        self._seen = SeenTags(self.room, np.random.default_rng((self.room.config.seed, 12)))
+        self._tags = StaticTags(self.model, self._seen) if config.static_tags else None  # type: ignore[arg-type]
 
     def run(self, seconds: float) -> None:
         """Advance the time."""
@@ -103,6 +169,8 @@ class Rehearsal:
         self.now_s += self.frame_s
         room, now = self.room, self.now_s
         room.pass_to(now)
+        if self._tags is not None:
+            self._follow_camera(self._tags)
         if now < self.no_marker_from_s:
             self.poses.add(self._observed(now))
         status = self.stage.status()
@@ -134,6 +202,8 @@ class Rehearsal:
             ),
             answer,
             self._aims,
+            None if self._tags is None else self._tags.moving_since_s,
+            math.inf if self._tags is None else self._tags.still_until_s(now),
         )
         self._said = []
         for action in self.workflow.step(view):
@@ -145,6 +215,17 @@ class Rehearsal:
             if answer is not None and answer.sigma_rad is not None and answer.sigma_rad < TRACK_SIGMA_RAD:
                 self.errors_deg.append(math.degrees(abs(status.scan_rad - room.plane_rad(now))))
             room.proceed(now)
+
+    def _follow_camera(self, tags: StaticTags) -> None:
+        """What the static tags show of the camera, in the frames that are searched as a whole."""
+        self._frames += 1
+        whole = self._seen.whole(self.now_s) if self._frames % EVERYWHERE == 0 else None
+        move = tags.step(whole, self.now_s, with_board=False)
+        self.messages += [(self.now_s, Tell(text)) for text in tags.news()]
+        if move is not None:
+            since = min(self.now_s, move.since_s)
+            self.engine.add(CameraMoved(self.now_s, move.camera_new_T_camera_old, move.covariance, True, since))
+            self.poses.clear()
 
     def _do(self, action: Action) -> None:
         if not isinstance(action, Tell):

@@ -203,6 +203,9 @@ class Tags:
         ended, self.ended = self.ended, None
         return ended
 
+    def still_until_s(self, now_s: float) -> float:
+        return now_s
+
     def news(self) -> list[str]:
         return []
 

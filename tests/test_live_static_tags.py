@@ -24,7 +24,7 @@ from fgreg.live import static_tags
 from fgreg.live.launch import setup_text
 from fgreg.live.marker_tracker import WholeFrame
 from fgreg.live.scope_holder import HolderMove
-from fgreg.live.static_tags import MOST_ALARMS, UNREST_S, StaticTags
+from fgreg.live.static_tags import MOST_ALARMS, SHIFTED_FRAMES, UNREST_S, UNSEEN_S, StaticTags
 from fgreg.model.events import CameraMovedEvent
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Stamp
@@ -41,6 +41,13 @@ def of_room(config: RoomConfig) -> SessionModel:
     model = read_setup(session_document(config.scene), "session.yaml", "room", []).model
     assert model is not None
     return model
+
+
+def _corners_px(camera_T_tag: FloatArray) -> FloatArray:
+    """Corners (4, 2) of a tag of 20 mm in a camera of 300 px focal length."""
+    square = np.array([[-10.0, 10.0, 0.0], [10.0, 10.0, 0.0], [10.0, -10.0, 0.0], [-10.0, -10.0, 0.0]])
+    points = square @ camera_T_tag[:3, :3].T + camera_T_tag[:3, 3]
+    return np.asarray(160.0 + 300.0 * points[:, :2] / points[:, 2:])
 
 
 class Pictures:
@@ -72,12 +79,12 @@ class Pictures:
     def frames(self, count: int, moved: Callable[[float], None] = lambda _t: None) -> HolderMove | None:
         """More frames, 0.7 s apart; the move that has ended in them."""
         ended = None
-        found = tuple(FoundTag(number, np.zeros((4, 2))) for number in self.poses)
-        view = ViewCorners(None, (), (), np.zeros((0, 2)), found)
         picture = np.zeros((2, 2), np.uint8)
         for _ in range(count):
             self.now_s += 0.7
             moved(self.now_s)
+            found = tuple(FoundTag(number, _corners_px(pose)) for number, pose in self.poses.items())
+            view = ViewCorners(None, (), (), np.zeros((0, 2)), found)
             frame = StereoFrame(Stamp(self.now_s, self.now_s), picture, picture, 0)
             for whole in (WholeFrame(self.now_s, frame, view, view), None):
                 ended = self.tags.step(whole, self.now_s, with_board=False) or ended
@@ -113,6 +120,48 @@ def test_a_bump_is_noticed_within_two_frames_and_measured_once_the_camera_rests(
     assert pictures.tags.moving_since_s is None
     assert any("has moved" in text for text in pictures.told)
     assert pictures.frames(30) is None, "the new epoch has a reference of its own"
+
+
+def test_the_marker_is_followed_as_far_as_a_frame_shows_the_tags_in_their_place(pictures: Pictures) -> None:
+    assert pictures.tags.still_until_s(0.0) == math.inf, "nothing is known of the tags yet"
+    pictures.frames(30)
+    assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s
+    rested_s = pictures.now_s
+    pictures.bump()
+    pictures.frames(1)
+    assert pictures.tags.still_until_s(pictures.now_s) == rested_s
+    assert pictures.tags.moving_since_s is None, "one frame may be wrong"
+    pictures.bump(inverse(BUMP))
+    pictures.frames(1)
+    assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s
+    pictures.poses.clear()
+    pictures.frames(1)
+    assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s - 0.7
+    assert pictures.tags.still_until_s(pictures.now_s + UNSEEN_S) == math.inf, "the tags are out of view"
+
+
+def test_a_shift_that_the_poses_do_not_call_a_move_ends(pictures: Pictures, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures.frames(30)
+    with monkeypatch.context() as context:  # the pictures show a shift that the poses do not have
+        context.setattr(Pictures, "bump", lambda *_: None)
+        context.setattr("tests.test_live_static_tags._corners_px", lambda _: np.full((4, 2), 90.0))
+        assert pictures.frames(SHIFTED_FRAMES) is None
+        assert pictures.tags.moving_since_s is not None
+        assert pictures.frames(12) is None
+        assert pictures.tags.moving_since_s is None
+        assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s
+
+
+def test_a_shift_without_poses_becomes_a_move_of_unknown_motion(
+    pictures: Pictures, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures.frames(30)
+    pictures.bump()
+    with monkeypatch.context() as context:
+        context.setattr(static_tags, "static_poses", lambda _: {})
+        ended = pictures.frames(math.ceil(UNREST_S / 0.7) + 3)
+    assert ended is not None
+    assert ended.camera_new_T_camera_old is None
 
 
 def test_a_frame_from_before_a_reported_move_is_no_reference_of_the_new_epoch(

@@ -20,15 +20,17 @@ from fgreg.stage.limits import MotionKind
 from tests.rehearsal import Rehearsal
 
 
-def rehearsal(seed: int = 3, *, aims: int = 8, frame_s: float = 1.0 / 15.0, **options: object) -> Rehearsal:
-    room = Room(room_config(seed, aims=aims, bump_every_s=math.inf))
+def rehearsal(
+    seed: int = 3, *, aims: int = 8, frame_s: float = 1.0 / 15.0, static_tags: int = 0, **options: object
+) -> Rehearsal:
+    room = Room(room_config(seed, aims=aims, bump_every_s=math.inf, static_tags=static_tags))
     return Rehearsal(room, frame_s=frame_s, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
 def whole() -> Rehearsal:
     """A session up to following, and 80 s of it."""
-    session = rehearsal()
+    session = rehearsal(static_tags=3)
     while session.workflow.stage is not Stage.FOLLOWING and session.now_s < 240.0:
         session.run(1.0)
     predicted = session.engine.estimate.predicted_tre
@@ -184,10 +186,29 @@ def test_a_verification_searches_new_pms_and_adds_nothing(whole: Rehearsal) -> N
     assert found.validity is Validity.VALID, (found.reason, known)
 
 
+def test_with_static_tags_no_order_comes_from_a_bumped_camera_and_the_registration_goes_on(whole: Rehearsal) -> None:
+    # it changes the session: of the tests that use it only the next one comes later
+    orders, bumps = len(whole.actions), 3
+    for _ in range(bumps):
+        whole.room.bump(whole.now_s)
+        whole.run(8.0)
+    followed = [action for _, action in whole.actions[orders:] if isinstance(action, Follow)]
+    assert followed
+    off = [(action.scan_rad - whole.room.plane_rad(action.marker_s)) / action.sigma_rad for action in followed]
+    assert max(map(abs, off)) < 4.0, "in sigmas of what was said"
+    estimate = whole.engine.estimate
+    assert estimate.epoch == bumps
+    assert estimate.verdict is not Verdict.REFUSED
+    assert estimate.predicted_tre is not None
+    assert whole.error_mm() < estimate.predicted_tre.worst_mm
+    assert any("as measured" in tell.text for _, tell in whole.messages)
+
+
 def test_after_a_reported_move_it_halts_and_searches_again(whole: Rehearsal) -> None:
     # last of the tests that use the session: it changes it
     from fgreg.online.events import CameraMoved
 
+    whole._tags = None  # nobody but the operator says that the camera has moved
     whole.room.bump(whole.now_s)
     whole.run(1.0)
     whole.engine.add(CameraMoved(whole.now_s))

@@ -14,7 +14,7 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.room import Room, room_config
+from fgreg.stage.limits import MotionLimits
 from tests.rehearsal import Rehearsal
 
 SAMPLE_S = 1.0
@@ -44,6 +45,8 @@ BOUND = 1.96
 """Sigmas of a 95 % bound."""
 FIRST_OK_S, MOST_FIRST_OK_S = 200.0, 400.0
 WRONG_SHARE, OFF_SHARE, ORDERS = 0.005, 0.001, 3000
+SIGMA_RAD = next(limit.default for limit in fields(MotionLimits) if limit.name == "track_sigma_rad")
+"""An order that is less certain is refused by the stage's safety gate."""
 BEAT = "the main program's heartbeat is missing"
 
 
@@ -55,7 +58,8 @@ class Figures:
         first_ok_s: time of the first ok. spots: PMs taken by then, or at the end.
         oks: (error, stated bound) in mm at the worst target, of each change of the estimate that was said to be ok.
         seconds_ok, seconds_wrong: seconds in which ok was shown, and in which it was off by more than twice its bound.
-        orders_sigma: error of each order to follow in the sigmas that were said, by the beam at its marker's exposure.
+        orders_sigma: error of each order to follow that the stage's safety gate lets through, in the sigmas that were
+            said, by the beam at its marker's exposure.
         stops: reasons of the stage's stops, but for the operator's and those for lost tracking.
         spent: what the time went into. slow: what was said of the machine. lost: messages about lost parts.
         refused: why pairs were refused, in made-up time.
@@ -144,7 +148,8 @@ class _Watched(Rehearsal):
         if self.reports and len(self.room.moved_s) > self._bumps:
             self._bumps = len(self.room.moved_s)
             self._said.append(OperatorCommand(CommandKind.MOVED))
-        ok = estimate.verdict is Verdict.OK and estimate.predicted_tre is not None
+        moving = self._tags is not None and self._tags.moving_since_s is not None
+        ok = estimate.verdict is Verdict.OK and estimate.predicted_tre is not None and not moving
         if ok and math.isnan(figures.first_ok_s):
             figures.first_ok_s = self.now_s
         sample = self.now_s - self._sampled_s > SAMPLE_S
@@ -171,7 +176,7 @@ class _Watched(Rehearsal):
         if isinstance(action, TakeMove):
             self.engine.add(CameraMoved(self.now_s))
             return
-        if isinstance(action, Follow):
+        if isinstance(action, Follow) and action.sigma_rad <= SIGMA_RAD:
             goal, at_s = self._order
             if not (abs(action.scan_rad - goal) < AGAIN_RAD and self.now_s - at_s < AGAIN_S):
                 self._order = (action.scan_rad, self.now_s)
@@ -180,9 +185,11 @@ class _Watched(Rehearsal):
         super()._do(action)
 
 
-def rehearsed(seed: int, aims: int, bump_every_s: float, seconds: float, *, first: bool, reports: bool) -> Figures:
-    """A room in made-up time. ``first``: it ends at the first ok."""
-    watched = _Watched(Room(room_config(seed, aims=aims, bump_every_s=bump_every_s)))
+def rehearsed(
+    seed: int, aims: int, bump_every_s: float, seconds: float, tags: int, *, first: bool, reports: bool
+) -> Figures:
+    """A room in made-up time, with this number of static tags. ``first``: it ends at the first ok."""
+    watched = _Watched(Room(room_config(seed, aims=aims, bump_every_s=bump_every_s, static_tags=tags)))
     watched.figures, watched.reports = Figures(seed), reports
     while watched.now_s < seconds and not (first and math.isfinite(watched.figures.first_ok_s)):
         watched.run(1.0)
@@ -195,15 +202,15 @@ def rehearsed(seed: int, aims: int, bump_every_s: float, seconds: float, *, firs
 
 
 def conducted(
-    folder: Path, seed: int, width_px: int, aims: int, bump_every_s: float, seconds: float, *, first: bool
+    folder: Path, seed: int, width_px: int, aims: int, bump_every_s: float, seconds: float, tags: int, *, first: bool
 ) -> Figures:
     """A room in real time, as by ``fgreg live --no-viewer``."""
     figures = Figures(seed)
     samples: list[tuple[float, OnlineEstimate, bool]] = []
     orders: list[tuple[float, float, float]] = []
-    config = room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s)
+    config = room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s, static_tags=tags)
     with ExitStack() as stack:
-        room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s))
+        room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s, static_tags=tags))
         with running(room_setup(room.path, config), folder, SolveConfig()) as session:
             began, sampled, last = time.monotonic(), -math.inf, None
             loop, give = session.loop, session.loop._steering.order

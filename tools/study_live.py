@@ -300,6 +300,7 @@ def main() -> int:
     parser.add_argument("--width", type=int, default=640, help="of the camera's images, px")
     parser.add_argument("--aims", type=int, default=6)
     parser.add_argument("--bump-every", type=float, default=90.0, help="mean time between camera moves, s")
+    parser.add_argument("--tags", type=int, default=3, choices=range(4), help="--quick: static tags beside the tissue")
     parser.add_argument("--out", type=Path, default=Path("study-live"), help="folder of the sessions")
     parser.add_argument("--recorded", type=Path, nargs="+", help="sessions to compare instead")
     parser.add_argument("--every", action="store_true", help="print every event")
@@ -324,6 +325,7 @@ def quick(options: argparse.Namespace) -> int:
                 options.aims,
                 options.bump_every,
                 options.seconds,
+                options.tags,
                 first=options.first_ok,
                 reports=options.reported,
             )
@@ -336,6 +338,7 @@ def quick(options: argparse.Namespace) -> int:
                 options.aims,
                 options.bump_every,
                 options.seconds,
+                options.tags,
                 first=options.first_ok,
             )
         rooms.append(room)

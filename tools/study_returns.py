@@ -221,11 +221,9 @@ class TaggedRun:
         room.pass_to(now)
         if self.index % 12 == 0:
             room.proceed(now)  # the marker goes on, and may cover a tag
-        whole = None
-        if now >= self.tags.next_s:
-            left, right = room.pictures(now, self.index)
-            views = self.left.detect(left, whole=True), self.right.detect(right, whole=True)
-            whole = WholeFrame(now, StereoFrame(Stamp(now, now), left, right, self.index), *views)
+        left, right = room.pictures(now, self.index)
+        views = self.left.detect(left, whole=True), self.right.detect(right, whole=True)
+        whole = WholeFrame(now, StereoFrame(Stamp(now, now), left, right, self.index), *views)
         move = self.tags.step(whole, now, with_board=False)
         move = self.tags.step(None, now + LATENCY_S, with_board=False) or move
         self.news += self.tags.news()

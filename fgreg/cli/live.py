@@ -30,6 +30,7 @@ IN_CONFIG = {
     "aims": "settings.aims",
     "bumps": "room.bump_every_s",
     "width": "room.width",
+    "static_tags": "room.static_tags",
     "limit_mm": "settings.limit_mm",
 }
 """Parameters of the command, and their keys in CONFIG.yaml."""
@@ -75,6 +76,10 @@ def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBa
             float,
             typer.Option("--bump-every", metavar="S", help="Mean time between moves of the simulated camera."),
         ] = 240.0,
+        static_tags: Annotated[
+            int,
+            typer.Option("--static-tags", help="Tags beside the simulated tissue that show camera moves; 0 to 3."),
+        ] = 3,
         width: Annotated[
             int,
             typer.Option(
@@ -136,7 +141,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBa
             viewer, display = not (no_viewer or silent), LiveDisplay(silent)
             seen = viewer or rrd is not None
             if config is None:
-                setup = _room(stack, seed, aims, bumps, width, seen=seen)
+                setup = _room(stack, seed, aims, bumps, width, static_tags, seen=seen)
             else:
                 setup, settings = _configured(stack, config, display, seen=seen)
             figures = _conduct(setup, folder, settings, duration, rrd, display, viewer=viewer)
@@ -162,7 +167,9 @@ def _alone(context: typer.Context) -> None:
             raise InputError(option, "it, and a CONFIG.yaml", f"{key} in the CONFIG.yaml instead")
 
 
-def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, *, seen: bool) -> "LiveSetup":
+def _room(
+    stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, static_tags: int, *, seen: bool
+) -> "LiveSetup":
     from fgreg.live.simulated_room import simulated_room
 
     if not 0 <= seed < 2**31:
@@ -173,7 +180,9 @@ def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px:
         raise InputError("--aims", str(aims), "0 to 100")
     if not bump_every_s >= 1:
         raise InputError("--bump-every", str(bump_every_s), "1 s or more, or inf")
-    return simulated_room(stack, seed, aims, bump_every_s, width_px, seen=seen)
+    if not 0 <= static_tags <= 3:
+        raise InputError("--static-tags", str(static_tags), "0 to 3")
+    return simulated_room(stack, seed, aims, bump_every_s, width_px, static_tags=static_tags, seen=seen)
 
 
 def _configured(stack: ExitStack, path: Path, display: "LiveDisplay", *, seen: bool) -> "tuple[LiveSetup, SolveConfig]":

@@ -136,7 +136,7 @@ def status_line(status: Status) -> str:
     known = status.recorder.registration
     lost = f"  lost: {', '.join(status.lost)}" if status.lost else ""
     verdict = status.verdict.value if known.registered else "no registration"
-    state = f"epoch {known.epoch}, {known.pairs} looks, {verdict}"
+    state = f"epoch {known.epoch}, {known.pairs} inlier looks, {verdict}"
     return f"{status.stage:<11} {state:<36} {status.text}{lost}"
 
 
@@ -165,7 +165,7 @@ def status_rows(figures: Figures, stage: StageModel, status: Status) -> list[Row
         rows.append(Row("trouble", state.trouble, "red", 2))
     rows.append(Row("next", next_line(now), "bold"))
     rows.append(Row("stage", stage_line(now, stage), rank=1))
-    rows.append(Row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} looks in it", rank=5))
+    rows.append(Row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} inlier looks in it", rank=5))
     latency = f", {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
     slow = bool(figures.latency_ms) and figures.latency_ms[-1] > SLOW_MS
     seen = f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from fgreg.drivers.base import CommandKind, OperatorCommand
@@ -89,6 +90,8 @@ class Inputs:
         aims: number of recorded calibration shots.
         camera_moving_s: host time since which the camera has been moving, or since which a move has been missing in
             the estimate: the registration is invalid. None while it is valid.
+        still_until_s: host time of the newest frame in which static tags show that the camera stands: newer poses of
+            the marker are not followed. Infinite where no static tags are in view.
     """
 
     now_s: float
@@ -100,6 +103,7 @@ class Inputs:
     tracking: TrackEstimate | None
     aims: int
     camera_moving_s: float | None = None
+    still_until_s: float = math.inf
 
 
 # --- what the workflow asks for -----------------------------------------------------------------------------------

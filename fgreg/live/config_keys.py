@@ -31,7 +31,7 @@ class RoomOptions:
         BUMP_EVERY_S
     )
     width: Annotated[int, Key("of its camera's images, px", Integer(160, 1920))] = 640
-    static_tags: Annotated[int, Key("beside the tissue", Integer(0, 3))] = 0
+    static_tags: Annotated[int, Key("beside the tissue", Integer(0, 3))] = 3
 
 
 @dataclass(frozen=True, slots=True)

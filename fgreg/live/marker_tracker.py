@@ -21,6 +21,8 @@ from fgreg.model.time_sync import DeviceClock, PoseHistory, TimedPose
 
 POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled again after every ``POOL_EVERY`` detections, over the last ``POOL_OVER``."""
+WHOLE_S = 1.0
+"""A whole image is searched at least this often: the stage waits for what it shows of the static tags."""
 LEAVES = 1.25
 """The next frame begins no sooner than this many times what the last one took: on a slow machine the registration and
 the locator need a processor, too."""
@@ -59,6 +61,7 @@ class MarkerTracker:
         self._found = 0
         self._waiting: StereoFrame | None = None
         self._flying: tuple[StereoFrame, float] | None = None  # the frame in hand, its exposure's host time
+        self._searches_whole, self._whole_s = False, -math.inf  # the frame in hand; when the last such one began
         self._views: list[tuple[ViewCorners | None] | None] = []
         self._began_s, self._next_s, self._from_s = 0.0, -math.inf, -math.inf
         self.poses = PoseHistory()
@@ -105,8 +108,10 @@ class MarkerTracker:
         ready = [worker.ready(picture) for worker, picture in zip(self._workers, pictures, strict=False)]
         if not all(ready):
             return
+        self._searches_whole = self._begun % EVERYWHERE == 0 or now_s - self._whole_s > WHOLE_S
+        self._whole_s = now_s if self._searches_whole else self._whole_s
         for worker, picture in zip(self._workers, pictures, strict=False):
-            worker.submit(picture, whole=self._begun % EVERYWHERE == 0)  # both views at once
+            worker.submit(picture, whole=self._searches_whole)  # both views at once
         self._begun += 1
         self._flying, self._waiting = (frame, self._clock.host_time(frame.stamp)), None
         self._views, self._began_s = [None] * len(pictures), now_s
@@ -132,7 +137,7 @@ class MarkerTracker:
             self.missing = lost.failure or "the picture's process was replaced"
             return True
         right = views[1] if len(views) > 1 else None
-        if self._begun % EVERYWHERE == 1:
+        if self._searches_whole:
             self.whole = WholeFrame(t_s, frame, left, right)
         fit = marker_from_views(left, right, self._marker)
         if isinstance(fit, NotFound):

@@ -5,6 +5,9 @@ are fitted in the locator's worker process, at a share :data:`SHARE` of one proc
 looks less often. A move is under way from the alarm until the camera is at rest again; it is then known with its
 covariance, against the poses kept for this epoch. Tags that do not stand still are reported and no longer used: they
 must not divide the session into epochs for ever.
+
+Poses take their time. So each searched frame is first tested by where the tags are in the picture
+(fgreg.camera_moves.tag_corners): the stage follows a marker only as far as such a frame shows the tags in their place.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from fgreg.camera_moves.static_tags import (
     observed,
     turn_rad,
 )
+from fgreg.camera_moves.tag_corners import TagCorners
 from fgreg.camera_moves.view_shift import view_shift_mm
 from fgreg.detection.corners import grey
 from fgreg.detection.static_tags import BOARD, StaticView, static_poses
@@ -47,6 +51,11 @@ UNREST_S = 12.0
 """A move that has not ended after this long ends with an unknown motion."""
 MOST_ALARMS, ALARMS_S = 4, 300.0
 """More alarms in this time than any bumped scope gives: the tags are not static."""
+UNSEEN_S = 3.0
+"""Where no tag was seen for this long the tags say nothing of the camera."""
+SHIFTED_FRAMES = 2
+"""Frames in a row with the tags out of their place, from which on the camera counts as moving."""
+BACK = "the camera is back where it was, by the static tags"
 UNSTEADY, APART = 12, 6
 """Frames after which a tag without a steady pose, or one that goes its own way, is no longer used."""
 
@@ -69,7 +78,6 @@ class StaticTags:
         locator: whose process fits the poses.
 
     Attributes:
-        moving_since_s: host time of the first frame after a move that has not ended; None while the camera stands.
         frames: in which a tag was found. next_s: host time from which the next one is looked at.
     """
 
@@ -87,7 +95,11 @@ class StaticTags:
         self._apart: Counter[int] = Counter()
         self._disagree = 0
         self._news: list[str] = []
-        self.moving_since_s: float | None = None
+        self._corners = TagCorners(_focal_px(model))
+        self._rest_s = self._seen_s = -np.inf  # newest frames: with the tags in their place, with any of them
+        self._shifted: list[float] = []  # host times of frames since then with the tags elsewhere
+        self._fitted = 0  # number of those whose poses are known
+        self._alarm_since_s: float | None = None
         self.frames = 0
         self.next_s = -np.inf
 
@@ -96,6 +108,17 @@ class StaticTags:
         """Numbers of the tags that are looked for."""
         return frozenset(self._tags) | (frozenset() if self._board is None else {BOARD})
 
+    @property
+    def moving_since_s(self) -> float | None:
+        """Host time of the first frame after a move that has not ended; None while the camera stands."""
+        if self._alarm_since_s is not None:
+            return self._alarm_since_s
+        return self._shifted[0] if len(self._shifted) >= SHIFTED_FRAMES else None
+
+    def still_until_s(self, now_s: float) -> float:
+        """Host time of the newest frame that shows the tags in their place; infinite where they say nothing."""
+        return self._rest_s if now_s - self._seen_s <= UNSEEN_S else np.inf
+
     def news(self) -> list[str]:
         """Messages about tags since the last call."""
         news, self._news = self._news, []
@@ -103,8 +126,9 @@ class StaticTags:
 
     def begin_again(self) -> None:
         """The camera has moved, as others tell: where the tags are is learnt again, from the frames to come."""
-        self._monitor, self.moving_since_s = TagMonitor(), None
+        self._monitor, self._alarm_since_s = TagMonitor(), None
         self._job, self._newest = None, self._given
+        self._learn_corners()
         self._apart.clear()
         self._disagree = 0
 
@@ -113,10 +137,13 @@ class StaticTags:
 
         ``with_board``: whether the board lies still now, which it does not while the laser is aimed at it.
         """
-        self._given = self._given if whole is None else whole
+        if whole is not None and whole is not self._given:
+            self._given = whole
+            self._test_corners(whole, now_s)
         move = self._take(now_s)
-        if self.moving_since_s is not None and now_s - self._alarm_s > UNREST_S:
-            move = HolderMove(self.moving_since_s, None, None)
+        since_s = self.moving_since_s
+        if since_s is not None and now_s - (since_s if self._alarm_since_s is None else self._alarm_s) > UNREST_S:
+            move = HolderMove(since_s, None, None)
             self.begin_again()
         if self.in_use and self._job is None and whole is not None and whole is not self._newest:
             board = with_board and self._board is not None and now_s >= self._board_s
@@ -124,6 +151,34 @@ class StaticTags:
                 self._newest = whole
                 self._submit(whole, now_s, board)
         return move
+
+    def _test_corners(self, whole: WholeFrame, now_s: float) -> None:
+        """Whether the tags that are known to stand still are where they were in the picture."""
+        steady = self._monitor.detector.means
+        views = [
+            {tag.id: tag.corners_px for tag in view.others or () if tag.id in self._tags and tag.id in steady}
+            for view in ([whole.left] if whole.right is None else [whole.left, whole.right])
+        ]
+        if self._alarm_since_s is not None or not any(views):
+            return
+        at_rest = self._corners.at_rest(views)
+        if at_rest is None:
+            return
+        self._seen_s = now_s
+        if at_rest:
+            if self.moving_since_s is not None:
+                self._news.append(BACK)
+            self._rest_s, self._fitted = whole.t_s, 0
+            self._shifted.clear()
+        else:
+            self._shifted.append(whole.t_s)
+            self.next_s = now_s  # their poses are wanted at once
+
+    def _learn_corners(self) -> None:
+        self._corners.begin_again()
+        self._rest_s = self._seen_s = -np.inf
+        self._shifted.clear()
+        self._fitted = 0
 
     def _in_view(self, whole: WholeFrame) -> bool:
         views = [whole.left] + ([] if whole.right is None else [whole.right])
@@ -161,17 +216,22 @@ class StaticTags:
         if not poses:
             return None
         self.frames += 1
+        self._fitted += bool(self._shifted) and job.t_s >= self._shifted[0]
         frame = observed(poses)
         self._monitor, found = monitored(self._monitor, job.t_s, frame, SETTINGS)
         if isinstance(found, TagsMoved):
             return self._alarm(found.since_t, now_s)
         if isinstance(found, TagsAtRest):
             return self._at_rest(found)
+        if self._fitted > max(SETTINGS.windows):  # shifted a little, which their poses do not call a move
+            self._learn_corners()
         self._check_tags(frame)
         return None
 
     def _alarm(self, since_s: float, now_s: float) -> HolderMove | None:
-        self.moving_since_s, self._alarm_s = since_s, now_s
+        since_s = self._shifted[0] if self._shifted else since_s
+        self._alarm_since_s, self._alarm_s = since_s, now_s
+        self._learn_corners()
         self._alarms.append(now_s)
         if len(self._alarms) <= MOST_ALARMS or now_s - self._alarms[0] > ALARMS_S:
             return None
@@ -185,13 +245,13 @@ class StaticTags:
         return HolderMove(since_s, None, None)
 
     def _at_rest(self, found: TagsAtRest) -> HolderMove | None:
-        since_s, self.moving_since_s = self.moving_since_s, None
+        since_s, self._alarm_since_s = self._alarm_since_s, None
         motion = found.camera_new_T_camera_old
         shift_mm = view_shift_mm(motion)
         if since_s is None:
             raise AssertionError("a rest without a move")
         if shift_mm < SETTINGS.least_mm:
-            self._news.append("the camera is back where it was, by the static tags")
+            self._news.append(BACK)
             return None
         self._news.append(
             "the static tags show that the camera has moved: "
@@ -223,3 +283,10 @@ class StaticTags:
             self._board = None
         name = "the board" if number == BOARD else f"static tag {number}"
         self._news.append(f"{name} {why}: it is not used to look for camera moves")
+
+
+def _focal_px(model: SessionModel) -> tuple[float, ...]:
+    """Focal length of each view."""
+    rig = model.camera
+    cameras = [] if rig is None else [rig.left, *([] if rig.right is None else [rig.right])]
+    return tuple(float(camera.matrix[0, 0]) for camera in cameras)

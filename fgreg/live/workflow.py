@@ -174,7 +174,9 @@ class Workflow:
             self._refused_pms = 0
             self._search = None
             self._end_verification("the camera has moved", out)
-            out.append(Tell("the camera has moved: the registration starts again"))
+            goes_on = _usable(inputs.registration)
+            measured = "the camera has moved, as measured: the registration goes on"
+            out.append(Tell(measured if goes_on else "the camera has moved: the registration starts again"))
         self._advance(inputs, out)
         if any(isinstance(action, Ask | Halt | Release) for action in out):
             self._search = None
@@ -466,7 +468,8 @@ class Workflow:
         if tracking is None or tracking.stage_rad is None or tracking.sigma_rad is None or newest is None:
             return
         plane = self._model.stage.scan_from_device(tracking.stage_rad)
-        if self._settings.follow and stage.requested is MotionKind.TRACK:
+        shown = newest.t_s <= inputs.still_until_s
+        if self._settings.follow and stage.requested is MotionKind.TRACK and shown:
             reason = f"following the beam, +- {math.degrees(tracking.sigma_rad):.1f} deg (1 sigma)"
             out.append(Follow(plane, tracking.sigma_rad, newest.t_s, reason))
         held = held_pose(inputs.poses, inputs.now_s)

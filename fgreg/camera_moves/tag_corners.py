@@ -1,0 +1,56 @@
+"""A quick test of the static tags: whether they are in the pictures where they were, without fitting their poses.
+
+A camera that moves shifts all of them in the picture at once, one that stands none. A shift of :data:`LIMIT_RAD`
+is 0.25 mm at 100 mm, which is less than the registration's error; the corners as the detector reports them repeat to a
+few tenths of a pixel. What the shift was, and whether it lasts, is for the tags' poses to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from fgreg.geometry.transforms import FloatArray
+
+LIMIT_RAD = 0.0025
+LEAST_PX = 1.2
+"""In small pictures the corners' own noise is larger than :data:`LIMIT_RAD`."""
+FIRST_FRAMES = 3
+"""Frames at the start whose mean is the place at rest."""
+
+
+class TagCorners:
+    """Where the static tags are in the pictures while the camera stands.
+
+    Args:
+        focal_px: focal length of each view.
+    """
+
+    def __init__(self, focal_px: Sequence[float]) -> None:
+        self._limit_px = [max(LIMIT_RAD * focal, LEAST_PX) for focal in focal_px]
+        self._first: dict[tuple[int, int], list[FloatArray]] = {}
+
+    def begin_again(self) -> None:
+        """Learn the place at rest anew, from the frames to come."""
+        self._first.clear()
+
+    def at_rest(self, views: Sequence[Mapping[int, FloatArray]]) -> bool | None:
+        """Whether the tags are where they were; None while no place at rest is known of those that are seen.
+
+        Args:
+            views: of either camera: corners (4, 2) px of the static tags in a frame, by tag.
+
+        Of several tags the middle one counts, so that one that is touched is no camera move; of two the farther one.
+        """
+        centres = {(view, tag): at.mean(axis=0) for view, seen in enumerate(views) for tag, at in seen.items()}
+        known = {key: first for key, first in self._first.items() if len(first) == FIRST_FRAMES}
+        shifts: dict[int, float] = {}
+        for view, tag in centres.keys() & known.keys():
+            shift = float(np.linalg.norm(centres[view, tag] - np.mean(known[view, tag], axis=0)))
+            shifts[tag] = max(shifts.get(tag, 0.0), shift / self._limit_px[view])
+        if shifts and sorted(shifts.values())[len(shifts) // 2] > 1.0:
+            return False
+        for key in centres.keys() - known.keys():
+            self._first.setdefault(key, []).append(centres[key])
+        return True if shifts else None
