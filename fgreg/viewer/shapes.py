@@ -39,8 +39,9 @@ JPEG_QUALITY = 80
 
 
 FLUSH_S = 600.0
-GATHER_S, GATHER_BYTES = 5.0, 1_000_000
-"""Rows of a file are gathered for this long, or up to this size."""
+GATHER_S, GATHER_BYTES = 60.0, 8_000_000
+"""Rows of a file are gathered for this long, or up to this size. Each write keeps some 4 kB an entity in memory until
+the end, for the file's index: 2 MB a minute at 5 s. A program that is killed loses what was gathered."""
 PASSING_BYTES = 100_000_000
 """Of pictures between the events of a live session: a quarter of an hour of them."""
 
@@ -48,8 +49,7 @@ PASSING_BYTES = 100_000_000
 class Recorder:
     """A recording stream into a file, a running viewer, or both, with the timelines ``shot`` and ``time``.
 
-    The file's rows are gathered for :data:`GATHER_S`, since each write has an overhead of some kB; a viewer gets them
-    at once.
+    The file's rows are gathered for :data:`GATHER_S`; a viewer gets them at once.
 
     Args:
         path: of the file. name: of the recording. url: of the viewer. own_id: of the recording; None: a random one.
