@@ -34,14 +34,8 @@ from fgreg.model.measurements import (
     VisibleSpot,
     default_marker_covariance,
 )
-from fgreg.model.session_model import (
-    NoiseModel,
-    ProbeModel,
-    SensitivityModel,
-    SessionModel,
-    StageModel,
-    default_targets_mm,
-)
+from fgreg.model.probe_model import ProbeModel, SensitivityModel
+from fgreg.model.session_model import NoiseModel, SessionModel, StageModel, default_targets_mm
 from fgreg.model.systematic import EXACT, Systematic
 
 MOTION_SIGMA = (0.002, 0.002, 0.002, 0.3, 0.3, 0.3)

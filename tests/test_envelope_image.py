@@ -15,7 +15,7 @@ from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import NoSignal, PaFind
 from fgreg.detection.wavefront_search import SEARCH_BANDS
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
+from fgreg.model.probe_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, Pulse, log_compressed, simulate_channels, simulate_envelope_image
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate

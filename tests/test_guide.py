@@ -18,7 +18,8 @@ import yaml
 import fgreg
 from fgreg.cli.main import main
 from fgreg.errors import InputError
-from fgreg.model.session_model import SESSION, ChannelModel, SessionModel
+from fgreg.model.probe_model import ChannelModel
+from fgreg.model.session_model import SESSION, SessionModel
 from fgreg.schema.yaml_writer import yaml_text
 from fgreg.session.setup_reader import read_setup
 from fgreg.session.yaml_loader import parse_yaml

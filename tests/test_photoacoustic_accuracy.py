@@ -12,7 +12,7 @@ from fgreg.detection.photoacoustic import locate_in_channels, locate_in_frame
 from fgreg.detection.results import PaFind
 from fgreg.detection.wavefront_fit import path_jacobian, path_mm
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import ChannelModel, ProbeModel, SensitivityModel
+from fgreg.model.probe_model import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, Pulse, quantised, simulate_channels
 
 IN_PLANE = Hearing(elevation=None)

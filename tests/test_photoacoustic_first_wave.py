@@ -12,7 +12,7 @@ import pytest
 from fgreg.detection.photoacoustic import locate_in_channels
 from fgreg.detection.results import NoSignal, PaFind
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import ChannelModel, ProbeModel, SensitivityModel
+from fgreg.model.probe_model import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Artefact, FaceSound, Hearing, PickUp, Pulse, Reflection, simulate_channels
 
 X_MM, RANGE_MM = 5.0, 25.0

@@ -10,7 +10,7 @@ import pytest
 from fgreg.detection.photoacoustic import locate_in_channels
 from fgreg.detection.results import PaFind
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import ChannelModel, ProbeModel, SensitivityModel
+from fgreg.model.probe_model import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, simulate_channels
 
 

@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from fgreg.cli.main import _exit_status
-from fgreg.model.session_model import SESSION, ChannelModel, SessionModel
+from fgreg.model.probe_model import ChannelModel
+from fgreg.model.session_model import SESSION, SessionModel
 from fgreg.schema.yaml_writer import yaml_text
 from fgreg.simulation.config import default_probe, default_stage
 from study_setup import SIGNS, DrawnRig, draw_rig, write_recordings

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import hilbert
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
+from fgreg.model.probe_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import (
     ElementHeight,
     Elevation,

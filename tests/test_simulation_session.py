@@ -15,7 +15,8 @@ import pytest
 import fgreg.simulation
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, log_so3
-from fgreg.model.session_model import NoiseModel, SensitivityModel, StageModel
+from fgreg.model.probe_model import SensitivityModel
+from fgreg.model.session_model import NoiseModel, StageModel
 from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import SimulatedSession, simulate

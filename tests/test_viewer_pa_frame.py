@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel
+from fgreg.model.probe_model import ChannelModel, ImageModel, ProbeModel
 from fgreg.viewer.pa_frame import PaPicture, pa_picture, texture
 from tests.forward import make_session
 

@@ -20,7 +20,8 @@ from fgreg.geometry.transforms import FloatArray, as_float_array, inverse
 from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.estimate import SessionEstimate, TargetEstimate, TrackEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
-from fgreg.model.session_model import ChannelModel, MarkerModel, SessionModel, StageModel, TagModel
+from fgreg.model.probe_model import ChannelModel
+from fgreg.model.session_model import MarkerModel, SessionModel, StageModel, TagModel
 from fgreg.simulation.lens import project_points
 from fgreg.viewer import endoscope_lines, endoscope_view, palette, scene, shapes
 from fgreg.viewer.blueprint import WORLD_PX

@@ -16,7 +16,8 @@ from fgreg.graph.columns import make_columns
 from fgreg.graph.packing import evidence, tells_of_constants
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Look, Measurements, Wavefront
-from fgreg.model.session_model import ChannelModel, ProbeModel, SensitivityModel, SessionModel
+from fgreg.model.probe_model import ChannelModel, ProbeModel, SensitivityModel
+from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import EXACT
 from fgreg.model.wavefront_evidence import (

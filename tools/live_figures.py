@@ -14,7 +14,7 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from fgreg.live.stage_commands import AGAIN_RAD, AGAIN_S
 from fgreg.model.estimate import Verdict
 from fgreg.model.events import NoteEvent, StageEvent
 from fgreg.model.hindrances import TOO_SLOW
+from fgreg.model.session_model import StageModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved
@@ -45,7 +46,7 @@ BOUND = 1.96
 """Sigmas of a 95 % bound."""
 FIRST_OK_S, MOST_FIRST_OK_S = 200.0, 400.0
 WRONG_SHARE, OFF_SHARE, ORDERS = 0.005, 0.001, 3000
-SIGMA_RAD = next(limit.default for limit in fields(MotionLimits) if limit.name == "track_sigma_rad")
+SIGMA_RAD = MotionLimits.of_session(StageModel(math.radians(2.0), (-1.0, 1.0))).track_sigma_rad
 """An order that is less certain is refused by the stage's safety gate."""
 BEAT = "the main program's heartbeat is missing"
 

@@ -30,7 +30,7 @@ import numpy as np
 from cramer_rao_bound import truth_covariance
 from fgreg.geometry.target_error import expected_tre_mm
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ChannelModel
+from fgreg.model.probe_model import ChannelModel
 from fgreg.simulation.acoustics import ElementHeight, Hearing, Pulse, noise_channels, simulate_channels
 from fgreg.simulation.config import default_probe
 from paper_sessions import simulated

@@ -30,7 +30,7 @@ from fgreg.detection.photoacoustic import locate_in_channels
 from fgreg.detection.results import NoSignal, PaFind
 from fgreg.detection.wavefront_fit import fit_wavefront
 from fgreg.geometry.transforms import FloatArray, as_float_array
-from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
+from fgreg.model.probe_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import (
     Artefact,
     FaceSound,

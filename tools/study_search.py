@@ -34,7 +34,7 @@ import numpy as np
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import SensitivityModel
+from fgreg.model.probe_model import SensitivityModel
 from fgreg.search.detection_model import DetectionModel
 from fgreg.search.planner import Found, Prediction, SearchPlanner, SearchSettings, Turn
 from fgreg.simulation.acoustics import Elevation

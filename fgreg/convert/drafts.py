@@ -15,7 +15,7 @@ from fgreg.convert.probe_frames import DeclaredProbe
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import StereoRig
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 
 Document = dict[str, Any]
 

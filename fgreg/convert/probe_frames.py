@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 
 _FAR_MM = 1e6
 _UNEVEN = 0.05

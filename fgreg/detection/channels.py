@@ -15,7 +15,7 @@ from scipy import fft as scipy_fft
 
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import BoolArray, FloatArray
-from fgreg.model.session_model import ChannelModel
+from fgreg.model.probe_model import ChannelModel
 
 Complex64Array = npt.NDArray[np.complex64]
 Float32Array = npt.NDArray[np.float32]

@@ -22,7 +22,7 @@ from scipy import ndimage, optimize
 from fgreg.detection.channels import check_frame
 from fgreg.detection.results import LEAST_RANGE_MM, NoSignal, OtherWave, PaFind
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ImageModel, ProbeModel
+from fgreg.model.probe_model import ImageModel, ProbeModel
 
 FALSE_ALARMS = 4e-4
 SCALES_MM = ((0.0, 0.0), (0.1, 0.15), (0.2, 0.4))

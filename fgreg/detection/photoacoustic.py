@@ -38,7 +38,7 @@ from fgreg.detection.wavefront_search import (
 )
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import BoolArray, FloatArray
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 
 FALSE_ALARMS = 2e-4
 """False-alarm rate: share of noise frames in which a source is found."""

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from fgreg.detection.channels import Band, Baseband, Channels, Float32Array, baseband, phasor
 from fgreg.geometry.transforms import BoolArray, FloatArray
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 
 SEARCH_BANDS = (Band(3.5, 1.2), Band(5.9, 1.7))
 SUBDIVISIONS = (2, 3)

@@ -30,8 +30,9 @@ from fgreg.model.measurements import (
     usable_covariance,
     visible_spots,
 )
+from fgreg.model.probe_model import SensitivityModel
 from fgreg.model.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
-from fgreg.model.session_model import SensitivityModel, SessionModel
+from fgreg.model.session_model import SessionModel
 from fgreg.model.wavefront_evidence import wavefront_evidence
 
 LEAST_EDGE_SIGMA_RAD = 1e-9

@@ -27,7 +27,8 @@ from fgreg.html_report.svg import (
     text,
 )
 from fgreg.model.estimate import EpochEstimate, PairEstimate, TrackEstimate
-from fgreg.model.session_model import ProbeModel, StageModel
+from fgreg.model.probe_model import ProbeModel
+from fgreg.model.session_model import StageModel
 from fgreg.viewer.scene import array_length_mm
 
 AXIS_MM = 22.0

@@ -13,7 +13,7 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.html_report.svg import BLUE, GREY, ORANGE, RED, Plane, circle, cross, drawing, path, text
 from fgreg.html_report.words import number
 from fgreg.model.estimate import TargetEstimate
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 from fgreg.viewer.scene import array_length_mm
 
 MOST_SLICES = 3

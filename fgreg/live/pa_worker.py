@@ -13,7 +13,7 @@ import numpy.typing as npt
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import NoSignal, PaFind
 from fgreg.errors import FgregError
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S, START_S = 10.0, 30.0

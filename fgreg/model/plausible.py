@@ -17,7 +17,8 @@ from fgreg.model.camera_model import StereoRig
 from fgreg.model.commissioned_rig import CommissionedRig
 from fgreg.model.lens import blind_px
 from fgreg.model.measurements import Aim, Measurements, Pair
-from fgreg.model.session_model import BoardModel, MarkerModel, NoiseModel, ProbeModel, SessionModel, StageModel
+from fgreg.model.probe_model import ProbeModel
+from fgreg.model.session_model import BoardModel, MarkerModel, NoiseModel, SessionModel, StageModel
 from fgreg.model.systematic import Systematic
 
 _LENGTHS = (("metres", 1000.0), ("cm", 10.0), ("micrometres", 1e-3))

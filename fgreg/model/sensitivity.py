@@ -22,7 +22,7 @@ from scipy.special import log_ndtr
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.measurements import Look
-from fgreg.model.session_model import SensitivityModel
+from fgreg.model.probe_model import SensitivityModel
 
 _Angles = npt.ArrayLike
 

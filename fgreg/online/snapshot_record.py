@@ -9,7 +9,8 @@ import numpy as np
 
 from fgreg.geometry.rig import COUNT
 from fgreg.model.estimate import Verdict
-from fgreg.model.session_model import SensitivityModel, SessionModel, StageModel
+from fgreg.model.probe_model import SensitivityModel
+from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.model.tissue_surface import MOST_POINTS, TissueSurface
 from fgreg.tracking.snapshot import SHARED, EpochSnapshot, Snapshot
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import SESSION, ProbeModel, SensitivityModel, SessionModel, default_targets_mm
+from fgreg.model.probe_model import ProbeModel, SensitivityModel
+from fgreg.model.session_model import SESSION, SessionModel, default_targets_mm
 from fgreg.model.systematic import NONE
 from fgreg.output.atomic_file import FileKind, check_output, write_file
 from fgreg.pipeline.setup import Compared, SetupConfig

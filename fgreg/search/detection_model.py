@@ -19,8 +19,8 @@ import numpy.typing as npt
 from scipy.special import ndtr
 
 from fgreg.geometry.transforms import FloatArray
+from fgreg.model.probe_model import SensitivityModel
 from fgreg.model.sensitivity import AMPLITUDE_SIGMA, amplitude_curve
-from fgreg.model.session_model import SensitivityModel
 
 ASSUMED_SIGMA = 0.15
 """Relative noise if the session has no curve; a bell of half height at the sensitivity window's edge is used then."""

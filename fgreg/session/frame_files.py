@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 from fgreg.errors import InputError
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 from fgreg.schema.files import FrameKind
 from fgreg.schema.limits import FRAME_BYTES, NPY_HEADER_BYTES, PICTURE_PIXELS
 from fgreg.schema.problems import shown

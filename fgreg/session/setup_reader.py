@@ -10,7 +10,8 @@ from typing import TypeVar
 from fgreg.errors import InputError
 from fgreg.model.camera_model import StereoRig
 from fgreg.model.plausible import implausible, implausible_rig, implausible_setup
-from fgreg.model.session_model import NAME, SESSION, BoardModel, MarkerModel, ProbeModel, SessionModel
+from fgreg.model.probe_model import ProbeModel
+from fgreg.model.session_model import NAME, SESSION, BoardModel, MarkerModel, SessionModel
 from fgreg.schema.problems import FieldError, Problem, input_error
 from fgreg.session.rig_file import read_rig, same_rig
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ChannelModel, ProbeModel
+from fgreg.model.probe_model import ChannelModel, ProbeModel
 from fgreg.simulation.array import TrueArray
 
 ChannelArray = npt.NDArray[np.float32]

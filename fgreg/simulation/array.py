@@ -9,7 +9,7 @@ import numpy as np
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

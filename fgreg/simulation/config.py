@@ -13,17 +13,8 @@ import numpy as np
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.camera_model import CameraModel, StereoRig
-from fgreg.model.session_model import (
-    BoardModel,
-    ChannelModel,
-    CharucoModel,
-    MarkerModel,
-    NoiseModel,
-    ProbeModel,
-    SensitivityModel,
-    StageModel,
-    TagModel,
-)
+from fgreg.model.probe_model import ChannelModel, ProbeModel, SensitivityModel
+from fgreg.model.session_model import BoardModel, CharucoModel, MarkerModel, NoiseModel, StageModel, TagModel
 from fgreg.model.static_tags import StaticTag
 from fgreg.model.systematic import Systematic
 from fgreg.simulation.acoustics import Artefact, Elevation, Pulse

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fgreg.model.session_model import BoardModel, ChannelModel, CharucoModel, ImageModel, NoiseModel
+from fgreg.model.probe_model import ChannelModel, ImageModel
+from fgreg.model.session_model import BoardModel, CharucoModel, NoiseModel
 from fgreg.simulation.config import SimulationConfig, Sweep, default_probe, default_rig
 from fgreg.simulation.disturbances import Disturbances
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform
-from fgreg.model.session_model import NoiseModel, ProbeModel, StageModel
+from fgreg.model.probe_model import ProbeModel
+from fgreg.model.session_model import NoiseModel, StageModel
 from fgreg.simulation.acoustics import Elevation
 from fgreg.simulation.array import TrueArray
 from fgreg.simulation.config import default_probe, default_stage

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform, transform_points
-from fgreg.model.session_model import ChannelModel, NoiseModel
+from fgreg.model.probe_model import ChannelModel
+from fgreg.model.session_model import NoiseModel
 from fgreg.model.static_tags import StaticTag
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig, default_probe, default_rig

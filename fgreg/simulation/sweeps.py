@@ -9,7 +9,8 @@ import numpy as np
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
-from fgreg.model.session_model import SensitivityModel, StageModel
+from fgreg.model.probe_model import SensitivityModel
+from fgreg.model.session_model import StageModel
 from fgreg.simulation.config import SimulationConfig, Sweep
 
 

@@ -16,7 +16,8 @@ from fgreg.geometry.transforms import FloatArray, IntArray
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.estimate import Verdict
-from fgreg.model.session_model import SensitivityModel, SessionModel, StageModel
+from fgreg.model.probe_model import SensitivityModel
+from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 
 DYNAMIC_RANGE_DB = 30.0
 """Largest range shown between black and white, below the frame's own maximum."""

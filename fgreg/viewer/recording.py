@@ -33,7 +33,8 @@ from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, exp_so3
 from fgreg.model.estimate import SessionEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
-from fgreg.model.session_model import ProbeModel, SessionModel
+from fgreg.model.probe_model import ProbeModel
+from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.output.atomic_file import NewFile
 from fgreg.viewer import legend, palette, scene, shapes, shot_labels, target_map

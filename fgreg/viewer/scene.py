@@ -17,8 +17,9 @@ from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transfo
 from fgreg.model.camera_model import CameraModel
 from fgreg.model.estimate import SessionEstimate
 from fgreg.model.measurements import Look
+from fgreg.model.probe_model import ProbeModel
 from fgreg.model.sensitivity import arc_of_rotation
-from fgreg.model.session_model import MarkerModel, ProbeModel
+from fgreg.model.session_model import MarkerModel
 from fgreg.viewer.palette import Color
 
 ShotKind = Literal["aim", "pair", "track"]

@@ -13,7 +13,7 @@ from bench.compare import Row, Section, Target, in_turn, rows_of, say
 from fgreg.detection.photoacoustic import locate_in_channels
 from fgreg.detection.results import PaFind
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import ProbeModel
+from fgreg.model.probe_model import ProbeModel
 from fgreg.simulation.acoustics import Hearing, Pulse, simulate_channels
 from study_photoacoustic import probe_for
 
