@@ -89,7 +89,9 @@ class WorkflowSettings:
     """How many shots and PMs to take, and what counts as a detection. The operator can end the calibration earlier."""
 
     aims: Annotated[int, Key("calibration shots", Integer(0, 1000))] = 8
-    pms: Annotated[int, Key("PMs of an epoch after which the stage may follow", Integer(1, 1000))] = 8
+    pms: Annotated[
+        int, Key("PMs since the last unmeasured camera move, after which the stage may follow", Integer(1, 1000))
+    ] = 8
     most_pms: Annotated[int, Key("the same where the verdict is a warning", Integer(1, 1000))] = 15
     hearing_threshold: Annotated[
         float,
@@ -170,11 +172,11 @@ class Workflow:
             self._end_verification("the camera moves", out)
             return tuple(out)
         if inputs.registration.epoch != self._epoch:
-            self._epoch, self._pms, self._done_at, self._missed = inputs.registration.epoch, 0, None, 0
-            self._refused_pms = 0
-            self._search = None
+            # A registration without pairs of this epoch is the one before, moved as the camera did.
+            goes_on = _usable(inputs.registration) and inputs.registration.pairs == 0
+            self._epoch, self._done_at, self._missed, self._search = inputs.registration.epoch, None, 0, None
+            self._pms, self._refused_pms = self._pms if goes_on else 0, 0
             self._end_verification("the camera has moved", out)
-            goes_on = _usable(inputs.registration)
             measured = "the camera has moved, as measured: the registration goes on"
             out.append(Tell(measured if goes_on else "the camera has moved: the registration starts again"))
         self._advance(inputs, out)
