@@ -175,7 +175,7 @@ def solve_jointly(
         first = _enough(whole, ~beyond.pm, ~beyond.aim)
     else:
         robust = graduated_or_near(whole, start, robust_aims=True)
-        start = robust.state
+        start = robust.state.take([0])
         first = _enough(whole, robust.pm_inlier[0], robust.aim_inlier[0])
     selection = select_inliers(whole, start, *first)
     kept, given = _enough(whole, selection.pm_inlier, selection.aim_inlier), set(whole.pms)
