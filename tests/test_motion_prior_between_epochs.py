@@ -11,20 +11,24 @@ from fgreg.camera_moves.detector import LoopClosure
 from fgreg.camera_moves.loop_closure import back_to
 from fgreg.camera_moves.recorded_session import find_epochs, split_epochs
 from fgreg.geometry.target_error import tre_mm
-from fgreg.geometry.transforms import FloatArray, inverse, make_transform
+from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform
+from fgreg.graph.shared_state import stack_states
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.events import events_in_order
-from fgreg.registration.register import register
+from fgreg.online.estimate import OnlineEstimate
+from fgreg.online.events import CameraMoved, events_in_order
+from fgreg.registration.joint_solve import solve_jointly
+from fgreg.registration.register import pack_session, register
 from fgreg.registration.solve import distance_to_explicit, solve
-from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera
-from tests.online_streams import batch, events, first, restored, sigmas_apart
+from tests.forward import MOTION_SIGMA, make_measurements, random_marker_T_laser, random_trus_T_camera
+from tests.online_streams import batch, events, first, restored, run, sigmas_apart, unreported_move
 
 AWAY = make_transform(np.eye(3), np.array([12.0, -9.0, 5.0]))
 CONFIG = SolveConfig()
+FAST = SolveConfig(posterior_effective=60.0, posterior_samples=600)
 
 
 def there_and_back(seed: int, counts: tuple[int, ...]) -> tuple[SessionModel, Measurements, list[FloatArray]]:
@@ -165,3 +169,70 @@ def test_what_an_earlier_epoch_lacks_is_no_reason_against_the_current_one() -> N
     assert not [reason for reason in estimate.reasons if "epoch 0" in reason]
     whole = solve(engine.measurements(), (), model, CONFIG)
     assert estimate.verdict is whole.epochs[1].verdict
+
+
+def _moved_without_moving(measurements: Measurements, pairs: int) -> Measurements:
+    """The measurements with a measured motion, of nothing, after the first pairs."""
+    start = EpochStart(measurements.pairs[pairs - 1].t + 0.01, np.eye(4), np.diag(np.square(MOTION_SIGMA)))
+    divided = tuple(replace(pair, epoch=int(index >= pairs)) for index, pair in enumerate(measurements.pairs))
+    return replace(measurements, pairs=divided, epochs=(measurements.epochs[0], start))
+
+
+def _live(model: SessionModel, measurements: Measurements) -> OnlineEstimate:
+    """The estimate of a session that has been taken up again, its last epoch with or without pairs."""
+    engine = OnlineRegistration(model, FAST, find_moves=False)
+    with engine.restoring():
+        run(engine, measurements)
+        for start in measurements.epochs[engine.state.epoch + 1 :]:
+            engine.add(CameraMoved(start.t, start.camera_new_T_camera_old, start.covariance))
+    assert engine.estimate.epoch == len(measurements.epochs) - 1
+    return engine.estimate
+
+
+def test_an_epoch_tied_to_one_that_contradicts_itself_is_not_ok() -> None:
+    hidden = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([2.0, 0.0, 0.0]))
+    model, measurements, _ = unreported_move(2, hidden, 9, 6)
+    estimate = _live(model, _moved_without_moving(measurements, 12))
+    assert estimate.verdict is not Verdict.OK
+    (reason,) = [text for text in estimate.reasons if "fit one registration" in text]
+    assert reason.startswith("epoch 0: ")
+
+
+def test_a_measured_motion_makes_nothing_ok_that_was_not() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(2), pairs=12, one_way=True)
+    one_sided = _live(model, _moved_without_moving(measurements, 12))
+    assert one_sided.verdict is Verdict.WARNING
+    assert [text for text in one_sided.reasons if "sweeps went one way" in text]
+    model, measurements, _ = make_measurements(np.random.default_rng(2), pairs=12, looks_per_pm=2)
+    untested = _live(model, _moved_without_moving(measurements, 24))
+    assert untested.verdict is Verdict.WARNING
+    assert [text for text in untested.reasons if "no pair was taken since the camera moved" in text]
+    few = _live(model, _moved_without_moving(first(measurements, 10), 8))
+    assert few.verdict is Verdict.REFUSED
+    assert [text for text in few.reasons if text.startswith("5 pairs leave the registration open")]
+
+
+@pytest.mark.parametrize(("one_way", "verdict"), [(False, Verdict.OK), (True, Verdict.WARNING)])
+def test_a_new_epoch_is_judged_from_its_first_pair_on_as_by_the_whole_solve(one_way: bool, verdict: Verdict) -> None:
+    looks = 1 if one_way else 2
+    model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=13, looks_per_pm=looks, one_way=one_way)
+    moved = _moved_without_moving(measurements, 12 * looks)
+    engine = restored(OnlineRegistration(model, FAST, find_moves=False), first(moved, 12 * looks))
+    start = moved.epochs[1]
+    engine.add(CameraMoved(start.t, start.camera_new_T_camera_old, start.covariance))
+    for pair in moved.pairs[12 * looks :]:
+        estimate = engine.add(pair)
+        assert estimate.verdict is verdict, estimate.reasons
+    assert engine.settle().verdict is verdict
+
+
+def test_of_several_starts_one_registration_results() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(6), pairs=4)
+    found = register(measurements, model, CONFIG)
+    starts = stack_states([minimum.state for minimum in found.searches[0].minima[:2]])
+    assert starts.count == 2
+    aims = np.ones(len(measurements.aims), dtype=bool)
+    _, _, optimum, _ = solve_jointly(
+        measurements, lambda of: pack_session(of, model, CONFIG), starts, aims, clean=False
+    )
+    assert optimum.state.count == 1

@@ -78,7 +78,7 @@ def test_a_wrong_sound_speed_shows_where_pairs_are_many() -> None:
     (epoch,), (report,) = found.epochs, found.reports
     assert epoch.trus_T_camera is not None
     assert epoch.predicted_tre is not None
-    named = sum(condition.effect_mm for condition in report.conditions)
+    named = sum(condition.effect_mm for condition in report.common)
     worst = tre_mm(epoch.trus_T_camera, truth.trus_T_camera[0], model.targets_mm).max()
     assert epoch.predicted_tre.worst_mm - named < worst < epoch.predicted_tre.worst_mm
 

@@ -125,6 +125,10 @@ def chart_turn(step: FloatArray) -> FloatArray:
     return turn
 
 
+UNKNOWN = 1e-9
+"""Eigenvalue of a Hessian with a unit diagonal below which a direction is not determined."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadratic:
     """The cost ``c + 2 g' d + d' H d`` (chi square) of steps ``d`` from a state of one hypothesis.
@@ -152,6 +156,13 @@ class Quadratic:
         return Quadratic(
             self.state, self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian
         )
+
+    def above_minimum(self) -> Quadratic:
+        """The same less its smallest value, so that a test of residuals counts one equation per direction it knows."""
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.hessian), 1e-30))
+        inverse = np.linalg.pinv(self.hessian * np.outer(scale, scale), rcond=UNKNOWN, hermitian=True)
+        pull = scale * self.gradient
+        return replace(self, cost=float(pull @ inverse @ pull))
 
 
 def in_columns(quadratic: Quadratic, columns: Columns, other: Columns) -> Quadratic:

@@ -37,7 +37,7 @@ from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
-from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
+from fgreg.registration.epochs import FinishedEpochs, epoch_chains, has_registration, last_epoch
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import initialised
@@ -338,12 +338,20 @@ class OnlineRegistration:
             prior = self._finished_prior = self._finished_prior or finished_prior_at_start(state, self._setting)
         except ArithmeticError:
             return None
-        if prior is None:
+        if prior is None or (has_registration(prior) and not self._tied_are_ok()):
             return None
         if state.finished is None:
             self._state = replace(state, finished=prior)
         old = state.epochs[state.now.start.old(state.epoch)]
         return FinishedEpochs(prior, is_open=old.is_open and has_registration(prior))
+
+    def _tied_are_ok(self) -> bool:
+        """Whether no epoch that measured motions tie to the current one misses a condition that both have to meet."""
+        state, starts = self._state, tuple(epoch.start for epoch in self._state.epochs)
+        known = [k for k, epoch in enumerate(state.epochs) if epoch.state is not None or k == state.epoch]
+        chains = epoch_chains(Measurements((), (), starts), known)
+        tied = next(chain for chain in chains if state.epoch in chain)
+        return all(r.own_verdict is Verdict.OK for r in self._reports if r.estimate.index in tied[:-1])
 
     def _take_over(self, found: FullSolveResult) -> None:
         """Take over optimum, inliers and report of a full solve; where that fails the incremental estimate stays."""

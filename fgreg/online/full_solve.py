@@ -245,13 +245,16 @@ def _report(solution: Solution, case: FullSolveCase) -> Report:
         root = np.asarray(np.linalg.cholesky(covariance))
         optimum = registration.optimum.state.trus_T_camera(place)[0]
         shift = np.asarray(np.linalg.solve(optimum_root, pose_tangent(optimum, pose)))
+    reasons = solution.reasons
+    if solution.reports:  # what an earlier epoch lacks can no longer be mended, and is not of this registration
+        here = solution.reports[epoch]
+        reasons = worst_first((condition, condition.text) for condition in (*here.common, *here.conditions, *here.tied))
     return Report(
         case.serial,
         epoch,
         data.pairs,
         data.verdict,
-        # What an earlier epoch lacks can no longer be mended, and is not of this registration.
-        worst_first((c, c.text) for c in solution.reports[epoch].conditions) if solution.reports else solution.reasons,
+        reasons,
         pose,
         covariance,
         data.predicted_tre,

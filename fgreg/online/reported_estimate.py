@@ -63,7 +63,7 @@ def reported(
         verdict, reasons = report.verdict, report.reasons
     tre = gaussian_tre(covariance, pose, model.targets_mm)
     if report is not None:
-        tre = with_effects(tre, report.epochs[-1].conditions if report.epochs else ())
+        tre = with_effects(tre, report.epochs[-1].common if report.epochs else ())
     if not (math.isfinite(tre.worst_mm) and np.isfinite(pose).all()):
         raise ArithmeticError("the reported registration is not finite")
     for condition in accuracy(tre, config):

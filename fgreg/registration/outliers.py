@@ -35,7 +35,7 @@ from fgreg.graph.reduced_graph import (
     private_at,
 )
 from fgreg.graph.reduced_solver import distinct, optimize
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import UNKNOWN, SharedState
 
 OUTLIER_P = 1e-3
 """A shot is an outlier where an inlier would deviate as much with at most this probability."""
@@ -54,8 +54,6 @@ TOLERANCE = 1e-4
 """Newton decrement (chi square) at which a descent ends."""
 DIVERGED_CHI2 = 1e4
 """Least chi square of a PM that does not converge."""
-UNKNOWN = 1e-9
-"""Correlation eigenvalue below which the other shots do not determine a direction."""
 
 
 def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:

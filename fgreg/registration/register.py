@@ -290,9 +290,10 @@ def register(
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
     clean = all(search.clean for search in searches)
 
+    anchor = None if finished is None else finished.prior.above_minimum()
+
     def packed(of: Measurements) -> PackedProblem:
-        problem = pack_session(of, model, config)
-        return problem if finished is None else replace(problem, anchor=finished.prior)
+        return replace(pack_session(of, model, config), anchor=anchor)
 
     epochs = restrict_epochs(measurements, solvable)
     start = _best_start(measurements, chosen, solvable, packed, finished, clean=clean)

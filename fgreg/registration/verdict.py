@@ -350,6 +350,12 @@ def sweeps(pairs: Iterable[Pair], config: SolveConfig) -> list[Condition]:
     ]
 
 
+def untested_motion() -> list[Condition]:
+    """A measured camera motion that no pair has tested."""
+    text = "no pair was taken since the camera moved, and so none has tested the motion as it was measured: take a pair"
+    return [Condition(Verdict.WARNING, text)]
+
+
 def two_sided(pairs: Iterable[Pair]) -> bool:
     """Whether most PMs have looks from both sides."""
     sides: dict[int, set[int]] = {}
