@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from fgreg.camera_moves.recorded_tags import with_tag_moves
+from fgreg.camera_moves.static_tags import TagMonitor, TagsAtRest, TagsMoved
 from fgreg.detection.events_to_measurements import number_epochs
 from fgreg.detection.marker import ViewCorners
 from fgreg.detection.static_tags import BOARD, StaticView, static_poses, static_tag_fits, tags_beside
@@ -149,7 +150,44 @@ def test_a_shift_that_the_poses_do_not_call_a_move_ends(pictures: Pictures, monk
         assert pictures.tags.moving_since_s is not None
         assert pictures.frames(12) is None
         assert pictures.tags.moving_since_s is None
+        assert pictures.told == [static_tags.BACK]
         assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s
+
+
+@pytest.mark.parametrize(("shift_mm", "recorded"), [(0.1, False), (0.25, True)])
+def test_a_drift_that_raised_an_alarm_is_recorded_also_where_its_mean_is_less(
+    pictures: Pictures, monkeypatch: pytest.MonkeyPatch, shift_mm: float, recorded: bool
+) -> None:
+    pictures.frames(1)
+    motion = make_transform(np.eye(3), np.array([shift_mm, 0.0, 0.0]))
+    found = iter([TagsMoved(pictures.now_s), TagsAtRest(motion, np.diag(SIGMA**2))])
+    monkeypatch.setattr(static_tags, "monitored", lambda *_: (TagMonitor(), next(found)))
+    move = pictures.frames(2)
+    assert (move is not None) is recorded
+    assert (static_tags.BACK in pictures.told) is not recorded
+
+
+def test_slow_poses_do_not_make_a_small_shift_a_move(pictures: Pictures, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures.frames(30)
+    monkeypatch.setattr("tests.test_live_static_tags._corners_px", lambda _: np.full((4, 2), 90.0))
+    for _ in range(math.ceil(2.0 * UNREST_S / 2.1)):  # the locator is free in one of three frames
+        for busy in (True, True, False):
+            pictures.busy = busy
+            assert pictures.frames(1) is None
+    assert pictures.tags.moving_since_s is None
+
+
+def test_tags_that_shift_again_and_again_are_no_longer_used(
+    pictures: Pictures, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures.frames(30)
+    for _ in range(MOST_ALARMS + 1):  # by what their poses do not call a move
+        with monkeypatch.context() as context:
+            context.setattr("tests.test_live_static_tags._corners_px", lambda _: np.full((4, 2), 90.0))
+            pictures.frames(SHIFTED_FRAMES)
+        pictures.frames(2)
+    assert not pictures.tags.in_use
+    assert pictures.told.count(static_tags.BACK) == MOST_ALARMS
 
 
 def test_a_shift_without_poses_becomes_a_move_of_unknown_motion(

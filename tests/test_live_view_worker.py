@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
@@ -69,6 +70,10 @@ def test_frames_give_the_pose_of_both_views_or_the_reason_without_a_wait(
 ) -> None:
     model, pictures = room
     seeing = Seeing(tracker)
+    tracker.begin_again(math.inf)
+    assert seeing.see(*pictures[0]) is None
+    assert tracker.whole is None, "a picture from before a move is no place at rest of static tags either"
+    tracker.begin_again(-math.inf)
     for left, right in pictures:
         pose = seeing.see(left, right)
         expected = detect_marker(left, right, model.camera, model.marker)  # type: ignore[arg-type]

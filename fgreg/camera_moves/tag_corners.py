@@ -1,8 +1,9 @@
 """A quick test of the static tags: whether they are in the pictures where they were, without fitting their poses.
 
-A camera that moves shifts all of them in the picture at once, one that stands none. A shift of :data:`LIMIT_RAD`
+A camera that is bumped shifts all of them in the picture at once, one that stands none. A shift of :data:`LIMIT_RAD`
 is 0.25 mm at 100 mm, which is less than the registration's error; the corners as the detector reports them repeat to a
-few tenths of a pixel. What the shift was, and whether it lasts, is for the tags' poses to say.
+few tenths of a pixel. What the shift was, and whether it lasts, is for the tags' poses to say. So is a slow drift of
+the holder: the places at rest go along with it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ LEAST_PX = 1.2
 """In small pictures the corners' own noise is larger than :data:`LIMIT_RAD`."""
 FIRST_FRAMES = 3
 """Frames at the start whose mean is the place at rest."""
+LAST_FRAMES = 60
+"""Later it is the mean of about so many last ones."""
 
 
 class TagCorners:
@@ -29,11 +32,11 @@ class TagCorners:
 
     def __init__(self, focal_px: Sequence[float]) -> None:
         self._limit_px = [max(LIMIT_RAD * focal, LEAST_PX) for focal in focal_px]
-        self._first: dict[tuple[int, int], list[FloatArray]] = {}
+        self._at: dict[tuple[int, int], tuple[FloatArray, int]] = {}  # place at rest, and of how many frames it is
 
     def begin_again(self) -> None:
         """Learn the place at rest anew, from the frames to come."""
-        self._first.clear()
+        self._at.clear()
 
     def at_rest(self, views: Sequence[Mapping[int, FloatArray]]) -> bool | None:
         """Whether the tags are where they were; None while no place at rest is known of those that are seen.
@@ -44,13 +47,14 @@ class TagCorners:
         Of several tags the middle one counts, so that one that is touched is no camera move; of two the farther one.
         """
         centres = {(view, tag): at.mean(axis=0) for view, seen in enumerate(views) for tag, at in seen.items()}
-        known = {key: first for key, first in self._first.items() if len(first) == FIRST_FRAMES}
+        known = {key: place for key, (place, count) in self._at.items() if count >= FIRST_FRAMES}
         shifts: dict[int, float] = {}
         for view, tag in centres.keys() & known.keys():
-            shift = float(np.linalg.norm(centres[view, tag] - np.mean(known[view, tag], axis=0)))
+            shift = float(np.linalg.norm(centres[view, tag] - known[view, tag]))
             shifts[tag] = max(shifts.get(tag, 0.0), shift / self._limit_px[view])
         if shifts and sorted(shifts.values())[len(shifts) // 2] > 1.0:
             return False
-        for key in centres.keys() - known.keys():
-            self._first.setdefault(key, []).append(centres[key])
+        for key, centre in centres.items():
+            place, count = self._at.get(key, (centre, 0))
+            self._at[key] = place + (centre - place) / (count + 1), min(count + 1, LAST_FRAMES - 1)
         return True if shifts else None

@@ -22,7 +22,7 @@ from fgreg.model.time_sync import DeviceClock, PoseHistory, TimedPose
 POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled again after every ``POOL_EVERY`` detections, over the last ``POOL_OVER``."""
 WHOLE_S = 1.0
-"""A whole image is searched at least this often: the stage waits for what it shows of the static tags."""
+"""Where there are static tags, a whole image is searched at least this often: the stage waits for what it shows."""
 LEAVES = 1.25
 """The next frame begins no sooner than this many times what the last one took: on a slow machine the registration and
 the locator need a processor, too."""
@@ -52,7 +52,7 @@ class MarkerTracker:
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
         if model.camera is None or model.marker is None:
             raise ValueError("the session has no camera or no marker")
-        self._marker = model.marker
+        self._marker, self._whole_every_s = model.marker, WHOLE_S if model.static_tags else math.inf
         sides = 1 if model.camera.right is None else 2
         self._workers = [ViewWorker(model.camera, model.marker, side) for side in range(sides)]
         self._clock = DeviceClock(latency_s)
@@ -108,7 +108,7 @@ class MarkerTracker:
         ready = [worker.ready(picture) for worker, picture in zip(self._workers, pictures, strict=False)]
         if not all(ready):
             return
-        self._searches_whole = self._begun % EVERYWHERE == 0 or now_s - self._whole_s > WHOLE_S
+        self._searches_whole = self._begun % EVERYWHERE == 0 or now_s - self._whole_s > self._whole_every_s
         self._whole_s = now_s if self._searches_whole else self._whole_s
         for worker, picture in zip(self._workers, pictures, strict=False):
             worker.submit(picture, whole=self._searches_whole)  # both views at once
@@ -137,7 +137,7 @@ class MarkerTracker:
             self.missing = lost.failure or "the picture's process was replaced"
             return True
         right = views[1] if len(views) > 1 else None
-        if self._searches_whole:
+        if self._searches_whole and t_s >= self._from_s:
             self.whole = WholeFrame(t_s, frame, left, right)
         fit = marker_from_views(left, right, self._marker)
         if isinstance(fit, NotFound):

@@ -48,13 +48,15 @@ EVERY_S, MOST_S = 0.6, 3.0
 BOARD_EVERY_S = 10.0
 """Time between two frames in which a board that was not in view is looked for."""
 UNREST_S = 12.0
-"""A move that has not ended after this long ends with an unknown motion."""
+"""A move that has not ended after this long, or of which no pose has come, ends with an unknown motion."""
 MOST_ALARMS, ALARMS_S = 4, 300.0
 """More alarms in this time than any bumped scope gives: the tags are not static."""
 UNSEEN_S = 3.0
 """Where no tag was seen for this long the tags say nothing of the camera."""
 SHIFTED_FRAMES = 2
 """Frames in a row with the tags out of their place, from which on the camera counts as moving."""
+BACK_SHARE = 0.5
+"""Share of the least move below which the camera is back where it was; a holder that drifts is not."""
 BACK = "the camera is back where it was, by the static tags"
 UNSTEADY, APART = 12, 6
 """Frames after which a tag without a steady pose, or one that goes its own way, is no longer used."""
@@ -90,7 +92,7 @@ class StaticTags:
         self._board_s = -np.inf
         self._newest: WholeFrame | None = None  # searched for tags
         self._given: WholeFrame | None = None  # the last one that came
-        self._alarm_s = 0.0
+        self._unrest_s = 0.0  # of the alarm; while the tags are only out of their place, of the newest poses of them
         self._alarms: deque[float] = deque(maxlen=MOST_ALARMS + 1)
         self._apart: Counter[int] = Counter()
         self._disagree = 0
@@ -137,12 +139,15 @@ class StaticTags:
 
         ``with_board``: whether the board lies still now, which it does not while the laser is aimed at it.
         """
+        before_s = self.moving_since_s
         if whole is not None and whole is not self._given:
             self._given = whole
             self._test_corners(whole, now_s)
         move = self._take(now_s)
         since_s = self.moving_since_s
-        if since_s is not None and now_s - (since_s if self._alarm_since_s is None else self._alarm_s) > UNREST_S:
+        if before_s is None and since_s is not None and self._too_often(now_s):
+            return HolderMove(since_s, None, None)
+        if since_s is not None and now_s - self._unrest_s > UNREST_S:
             move = HolderMove(since_s, None, None)
             self.begin_again()
         if self.in_use and self._job is None and whole is not None and whole is not self._newest:
@@ -171,6 +176,7 @@ class StaticTags:
             self._rest_s, self._fitted = whole.t_s, 0
             self._shifted.clear()
         else:
+            self._unrest_s = self._unrest_s if self._shifted else now_s
             self._shifted.append(whole.t_s)
             self.next_s = now_s  # their poses are wanted at once
 
@@ -216,25 +222,27 @@ class StaticTags:
         if not poses:
             return None
         self.frames += 1
-        self._fitted += bool(self._shifted) and job.t_s >= self._shifted[0]
+        if self._shifted and job.t_s >= self._shifted[0]:
+            self._fitted, self._unrest_s = self._fitted + 1, now_s
         frame = observed(poses)
         self._monitor, found = monitored(self._monitor, job.t_s, frame, SETTINGS)
         if isinstance(found, TagsMoved):
-            return self._alarm(found.since_t, now_s)
+            self._alarm_since_s, self._unrest_s = self._shifted[0] if self._shifted else found.since_t, now_s
+            self._learn_corners()
+            return None
         if isinstance(found, TagsAtRest):
             return self._at_rest(found)
         if self._fitted > max(SETTINGS.windows):  # shifted a little, which their poses do not call a move
+            self._news += [] if self.moving_since_s is None else [BACK]
             self._learn_corners()
         self._check_tags(frame)
         return None
 
-    def _alarm(self, since_s: float, now_s: float) -> HolderMove | None:
-        since_s = self._shifted[0] if self._shifted else since_s
-        self._alarm_since_s, self._alarm_s = since_s, now_s
-        self._learn_corners()
+    def _too_often(self, now_s: float) -> bool:
+        """Count one more move; whether there are too many, so that the tags are no longer used."""
         self._alarms.append(now_s)
         if len(self._alarms) <= MOST_ALARMS or now_s - self._alarms[0] > ALARMS_S:
-            return None
+            return False
         self._tags.clear()
         self._board = None
         self.begin_again()
@@ -242,7 +250,7 @@ class StaticTags:
             f"the static tags moved {len(self._alarms)} times in {ALARMS_S / 60.0:.0f} minutes: they are not fixed, or "
             "the endoscope is not held. They are not used any more"
         )
-        return HolderMove(since_s, None, None)
+        return True
 
     def _at_rest(self, found: TagsAtRest) -> HolderMove | None:
         since_s, self._alarm_since_s = self._alarm_since_s, None
@@ -250,7 +258,7 @@ class StaticTags:
         shift_mm = view_shift_mm(motion)
         if since_s is None:
             raise AssertionError("a rest without a move")
-        if shift_mm < SETTINGS.least_mm:
+        if shift_mm < BACK_SHARE * SETTINGS.least_mm:
             self._news.append(BACK)
             return None
         self._news.append(
