@@ -172,6 +172,7 @@ class CommandKind(StrEnum):
     FOLLOW = "follow"
     MOVED = "moved"
     CHECK = "check"
+    POINT = "point"
     VERIFY = "verify"
     EXCLUDE = "exclude"
     INCLUDE = "include"
@@ -186,9 +187,10 @@ class OperatorCommand:
     ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
     ``search``, ``follow``: the stage may turn to search for PMs, or to follow the beam; ``next``: leave this spot;
     ``moved``: the camera has moved; ``check``: a point that both devices show now, at ``point`` (u, v in the left frame
-    and u, v in the right one, px; x and range in the image plane, mm); ``verify`` the registration with new PMs, which
-    are not added to it; ``exclude``, ``include``: the looks at ``pm`` do not count, or count again; ``stop`` the stage
-    at once; ``reset``: the latched stage has been inspected, and motions may be requested again.
+    and u, v in the right one, px; x and range in the image plane, mm); ``point``: the same as data of the registration;
+    ``verify`` the registration with new PMs, which are not added to it; ``exclude``, ``include``: the looks at ``pm``
+    do not count, or count again; ``stop`` the stage at once; ``reset``: the latched stage has been inspected, and
+    motions may be requested again.
 
     ``said_s``: host time at which it was said, or arrived. ``peer``: who said it; empty if unknown.
     """

@@ -17,6 +17,7 @@ LETTERS = {
     "n": CommandKind.NEXT,
     "m": CommandKind.MOVED,
     "c": CommandKind.CHECK,
+    "p": CommandKind.POINT,
     "v": CommandKind.VERIFY,
     "e": CommandKind.EXCLUDE,
     "i": CommandKind.INCLUDE,
@@ -28,6 +29,7 @@ release a stage that has latched."""
 AFTER = {
     CommandKind.AIM: "COLUMN ROW",
     CommandKind.CHECK: "U V U V X RANGE",
+    CommandKind.POINT: "U V U V X RANGE",
     CommandKind.EXCLUDE: "PM",
     CommandKind.INCLUDE: "PM",
 }
@@ -77,8 +79,8 @@ def understand(line: str, corners: tuple[int, int] | None = None) -> OperatorCom
         return f"{one_line(repr(line.strip()), 40)} is not understood; say {EXPECTED}"
     if said is CommandKind.AIM:
         return _aim(words[1:], corners)
-    if said is CommandKind.CHECK:
-        return _check(words[1:])
+    if said in (CommandKind.CHECK, CommandKind.POINT):
+        return _located(said, words[1:])
     if said in (CommandKind.EXCLUDE, CommandKind.INCLUDE):
         return _choice(said, words[1:])
     if len(words) > 1:
@@ -97,14 +99,14 @@ def _aim(words: list[str], corners: tuple[int, int] | None) -> OperatorCommand |
     return OperatorCommand(CommandKind.AIM, (column, row))
 
 
-def _check(words: list[str]) -> OperatorCommand | str:
+def _located(said: CommandKind, words: list[str]) -> OperatorCommand | str:
     if len(words) != 6 or not all(_DECIMAL.fullmatch(word) for word in words):
         return (
-            "a check is said as check U V U V X RANGE: a point's pixel in the left and in the right frame, and its x "
-            "and range (mm) in the image plane, turned to where it is brightest"
+            f"a {said} is said as {said} U V U V X RANGE: a point's pixel in the left and in the right frame, and its "
+            "x and range (mm) in the image plane, turned to where it is brightest"
         )
     u, v, right_u, right_v, x_mm, range_mm = (float(word) for word in words)
-    return OperatorCommand(CommandKind.CHECK, point=(u, v, right_u, right_v, x_mm, range_mm))
+    return OperatorCommand(said, point=(u, v, right_u, right_v, x_mm, range_mm))
 
 
 def _choice(said: CommandKind, words: list[str]) -> OperatorCommand | str:

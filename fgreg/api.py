@@ -67,6 +67,7 @@ def solve(
     detect_moves: bool = True,
     without_pms: Sequence[int] = (),
     without_aims: Sequence[int] = (),
+    without_points: Sequence[int] = (),
 ) -> SolveReport:
     """Solve a recorded session as a whole, as ``fgreg solve`` does.
 
@@ -77,12 +78,13 @@ def solve(
         rrd: where a Rerun recording is written; none where None.
         redetect: look at the frames even where events bring poses.
         detect_moves: look for unreported camera moves.
-        without_pms, without_aims: left out by hand; aims by their place among the session's aims, from 0.
+        without_pms, without_aims, without_points: left out by hand; aims and known points by their place among the
+            session's, from 0.
 
     Raises:
         InputError: bad input; no result is left behind, not even an older one.
     """
-    without = ShotNames(tuple(without_pms), tuple(without_aims))
+    without = ShotNames(tuple(without_pms), tuple(without_aims), tuple(without_points))
     return solve_session(SolveRequest(Path(session), _path(out), _path(rrd), redetect, detect_moves, without), config)
 
 

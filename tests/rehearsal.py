@@ -31,9 +31,9 @@ from fgreg.live.actions import (
     StageView,
     Sweep,
     TakeAim,
-    TakeCheck,
     TakeMove,
     TakePairs,
+    TakePoint,
     Tell,
 )
 from fgreg.live.marker_tracker import WholeFrame
@@ -249,7 +249,7 @@ class Rehearsal:
                 self.latched = ""
             case TakeAim():
                 self._aim()
-            case TakeMove() | TakeCheck():
+            case TakeMove() | TakePoint():
                 raise AssertionError("no one reported a move")
             case TakePairs(pm, looks):
                 spot = one_spot(looks)

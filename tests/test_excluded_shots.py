@@ -176,10 +176,15 @@ WRONG = {
         "--without-aim",
         "12",
     ],
+    "--without-point: found 0, expected a known point of the session, counted from 0: none": [
+        "solve",
+        "--without-point",
+        "0",
+    ],
     "--without-pm: found 3-7, expected numbers with commas between": ["solve", "--without-pm", "3-7"],
     "--pm: found 99, expected a PM of the session": ["exclude", "--pm", "3,99"],
     "--pm: found 3, expected a PM that is left out: none": ["include", "--pm", "3"],
-    "--pm and --aim: found nothing": ["exclude"],
+    "--pm, --aim and --point: found nothing": ["exclude"],
     "--without-pm: found nothing, expected numbers with commas": ["solve", "--without-pm", ""],
     "--aim: found 1,,2, expected numbers with commas": ["exclude", "--aim", "1,,2"],
 }
@@ -203,7 +208,7 @@ def test_a_shot_that_is_not_there_is_one_line_and_changes_nothing(
     ("event", "message"),
     [
         ({"type": "exclude", "pm": 20}, "pm: found 20, expected the PM of an earlier pair: 0 to 19"),
-        ({"type": "include", "line": 33}, "line: found 33, expected the line of an earlier aim or pair"),
+        ({"type": "include", "line": 33}, "line: found 33, expected the line of an earlier aim, pair or point"),
         ({"type": "exclude", "pm": 3, "line": 4}, "found both, expected pm or line"),
     ],
 )
@@ -225,7 +230,7 @@ def test_a_pm_that_is_looked_at_again_counts_again(pose_session: Path) -> None:
 def test_what_is_left_out_twice_keeps_its_reason(pose_session: Path) -> None:
     why = {"type": "exclude", "pm": 5, "reason": "bumped", "by": "A. N."}
     _append(pose_session, why, {"type": "exclude", "pm": 5})
-    twice = without_shots(read_session(pose_session), ShotNames((5, 6), (2,)), ("--without-pm", "--without-aim"))
+    twice = without_shots(read_session(pose_session), ShotNames((5, 6), (2,)), "--without-")
     assert [(shot.pm, shot.aim, shot.reason, shot.by) for shot in excluded_shots(twice.events).values()] == [
         (None, 2, "option --without-aim", ""),
         (5, None, "bumped", "A. N."),

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import fgreg
+from fgreg.cli.main import app
 from fgreg.model.estimate import SessionEstimate, Verdict
 from fgreg.model.measurements import Check, VisibleSpot
 from fgreg.model.plausible import implausible_measurements
@@ -78,6 +80,33 @@ def test_nor_in_measurements_of_a_program() -> None:
     assert estimate.checks[1].error_mm is not None
 
 
+def test_a_point_that_is_left_out_by_hand_is_as_if_it_had_never_been_taken(
+    tmp_path: Path, made: SimulatedSession
+) -> None:
+    points = [e for e in made.events if e["type"] == "point"]
+    x, y, z = points[1]["camera_p_mm"]
+    wrong = {**points[1], "camera_p_mm": [x + 12.0, y, z]}
+    there = {**points[1], "type": "check", "t": 1e4}  # is compared again, where the point is no data any more
+    events = [*(wrong if e is points[1] else e for e in made.events), there]
+    folder = write(tmp_path / "a", made, events)
+    run = CliRunner()
+    assert run.invoke(app, ["exclude", str(folder), "--point", "1,2", "--reason", "the echo of a clip"]).exit_code == 0
+    said = run.invoke(app, ["include", str(folder), "--point", "2"]).output
+    assert f"known point 1 at {wrong['t']:.1f} s: left out by hand: the echo of a clip" in " ".join(said.split())
+    estimate = solved(folder)
+    without = solved(write(tmp_path / "b", made, [e for e in events if e is not wrong]))
+    left, right = estimate.epochs[0].trus_T_camera, without.epochs[0].trus_T_camera
+    assert left is not None
+    assert right is not None
+    np.testing.assert_allclose(left, right, atol=1e-9)
+    assert [point.used for point in estimate.points] == [True, False, True]
+    assert estimate.points[1].reason == "left out by hand: the echo of a clip"
+    assert [(shot.type, shot.point, shot.pm, shot.aim) for shot in estimate.excluded] == [("point", 1, None, None)]
+    assert sum("left out by hand (known point 1)" in reason for reason in estimate.reasons) == 1
+    assert [check.error_mm is not None for check in estimate.checks] == [True]
+    assert estimate.verdict is Verdict.WARNING
+
+
 def test_replay_ends_where_solve_does(tmp_path: Path) -> None:
     made = simulate(replace(CONFIG, pairs=6, checks=1), 2)
     kinds = [e["type"] for e in made.events]
@@ -85,6 +114,8 @@ def test_replay_ends_where_solve_does(tmp_path: Path) -> None:
     point = early.pop(kinds.index("point"))
     place = len(early) - 4
     early.insert(place, {**point, "t": early[place - 1]["t"]})
+    later = next(line for line, e in enumerate(early, 1) if e["type"] == "point")
+    early.insert(later, {"type": "exclude", "t": early[later - 1]["t"], "line": later})
     folder = write(tmp_path, made, [*early, *made.checks])
     report = replay_session(ReplayRequest(folder, None, None), fgreg.SolveConfig())
     there = solved(folder)
@@ -92,7 +123,14 @@ def test_replay_ends_where_solve_does(tmp_path: Path) -> None:
     assert found.trus_T_camera is not None
     assert expected.trus_T_camera is not None
     np.testing.assert_allclose(found.trus_T_camera, expected.trus_T_camera, atol=1e-6)
-    assert len(report.solved.estimate.points) == 3
+    assert [(point.used, point.reason) for point in report.solved.estimate.points] == [
+        (False, "left out by hand"),
+        (True, ""),
+        (True, ""),
+    ]
+    assert report.solved.estimate.excluded == there.excluded
+    assert report.solved.estimate.reasons == there.reasons
+    assert report.settled is not None
 
 
 def test_epochs_take_their_points_with_them() -> None:

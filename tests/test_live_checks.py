@@ -12,7 +12,7 @@ import pytest
 from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.geometry.transforms import FloatArray, inverse, transform_points
 from fgreg.model.estimate import Verdict
-from fgreg.model.events import CheckEvent
+from fgreg.model.events import CheckEvent, ExcludeEvent, PointEvent
 from fgreg.model.lens import project
 from fgreg.session.session_reader import read_session
 from tests.test_live_camera_moves import Stand, standing
@@ -25,8 +25,8 @@ def stand(pose_session: Path) -> Iterator[Stand]:
         yield found
 
 
-def say_check(stand: Stand, error_mm: FloatArray) -> None:
-    """The operator's check in the present plane, at which the registration is off by ``error_mm``."""
+def say_check(stand: Stand, error_mm: FloatArray, kind: CommandKind = CommandKind.CHECK) -> None:
+    """The operator's check (or point) in the present plane, at which the registration is off by ``error_mm``."""
     model, estimate = stand.session.journal.model, stand.session.estimate
     assert estimate is not None
     assert estimate.trus_T_camera is not None
@@ -42,7 +42,7 @@ def say_check(stand: Stand, error_mm: FloatArray) -> None:
     camera_p = transform_points(inverse(estimate.trus_T_camera), (trus_p + error_mm)[None])[0]
     left, right = project(rig.left, camera_p), project(rig.right, transform_points(rig.right_T_left, camera_p[None])[0])
     point = (float(left[0]), float(left[1]), float(right[0]), float(right[1]), 2.0, 30.0)
-    stand.operator.waiting.append(OperatorCommand(CommandKind.CHECK, point=point))
+    stand.operator.waiting.append(OperatorCommand(kind, point=point))
 
 
 def checks_on_disk(stand: Stand) -> list[CheckEvent]:
@@ -74,6 +74,18 @@ def test_a_check_that_is_off_costs_the_ok(stand: Stand) -> None:
     known = stand.recorder.state.registration
     assert known.verdict is Verdict.WARNING
     assert any("the check is off by 6.0 mm along the probe" in reason for reason in known.reasons)
+
+
+def test_a_point_that_the_operator_names_is_data_until_it_is_left_out(stand: Stand) -> None:
+    say_check(stand, np.array([0.3, 0.0, 0.0]), CommandKind.POINT)
+    stand.turn(5.0, lambda: bool(stand.session.measurements().points))
+    assert any("point taken" in told for told in stand.operator.messages)
+    (event,) = [e for e in read_session(stand.session.journal.folder).events if isinstance(e, PointEvent)]
+    stand.recorder.hand_over(ExcludeEvent(event.t, 0, shot_line=event.line))
+    stand.turn(10.0, lambda: bool(stand.session.excluded) and not stand.recorder.state.choosing)
+    assert not stand.session.measurements().points
+    reasons = stand.recorder.state.registration.reasons
+    assert any("left out by hand (known point 0)" in reason for reason in reasons)
 
 
 def test_pixels_that_are_of_no_point_are_answered(stand: Stand) -> None:

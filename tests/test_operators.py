@@ -57,10 +57,13 @@ def test_an_aim_names_its_corner(line: str) -> None:
     assert understand(line, (9, 6)) == OperatorCommand(CommandKind.AIM, (3, 2))
 
 
-@pytest.mark.parametrize("line", ["check 640 350.5 600 351 -3.25 31", "c 640, 350.5, 600, 351, -3.25, 31"])
-def test_a_check_names_its_pixels_and_its_place_in_the_plane(line: str) -> None:
+@pytest.mark.parametrize(
+    "line", ["check 640 350.5 600 351 -3.25 31", "c 640, 350.5, 600, 351, -3.25, 31", "p 640 350.5 600 351 -3.25 31"]
+)
+def test_a_check_and_a_point_name_their_pixels_and_their_place_in_the_plane(line: str) -> None:
     point = (640.0, 350.5, 600.0, 351.0, -3.25, 31.0)
-    assert understand(line) == OperatorCommand(CommandKind.CHECK, point=point)
+    kind = CommandKind.CHECK if line.startswith("c") else CommandKind.POINT
+    assert understand(line) == OperatorCommand(kind, point=point)
 
 
 @pytest.mark.parametrize(("line", "kind"), [("exclude 3", CommandKind.EXCLUDE), ("I 12", CommandKind.INCLUDE)])
@@ -80,6 +83,7 @@ def test_a_choice_names_its_pm(line: str, kind: CommandKind) -> None:
         ("aim 3 6", "columns 0 to 8, rows 0 to 5"),
         ("check 1 2 3 4 5", "check U V U V X RANGE"),
         ("c 1 2 3 4 5 x", "check U V U V X RANGE"),
+        ("point 1 2 3", "a point is said as point U V U V X RANGE"),
         ("exclude", "exclude PM"),
         ("include 1 2", "include PM"),
         ("exclude PM", "exclude PM"),

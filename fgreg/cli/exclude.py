@@ -18,16 +18,21 @@ AimOption = Annotated[
     str | None,
     typer.Option("--aim", metavar="N,N", help="These aims, by their place among the session's aims, from 0."),
 ]
+PointOption = Annotated[
+    str | None,
+    typer.Option("--point", metavar="N,N", help="These known points, by their place among the session's, from 0."),
+]
 ReasonOption = Annotated[str, typer.Option("--reason", metavar="TEXT", help="Why; it is recorded.")]
 ByOption = Annotated[str, typer.Option("--by", metavar="NAME", help="Who decides it; it is recorded.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No text.")]
 
 
-def shot_names(pms: str | None, aims: str | None, options: tuple[str, str]) -> "ShotNames":
-    """Shots as options name them. Raises InputError."""
+def shot_names(pms: str | None, aims: str | None, points: str | None, prefix: str = "--") -> "ShotNames":
+    """Shots as options name them; ``prefix`` of these. Raises InputError."""
     from fgreg.pipeline.exclude import ShotNames
 
-    return ShotNames(_numbers(options[0], pms), _numbers(options[1], aims))
+    named = (("pm", pms), ("aim", aims), ("point", points))
+    return ShotNames(*(_numbers(f"{prefix}{what}", text) for what, text in named))
 
 
 def _numbers(option: str, text: str | None) -> tuple[int, ...]:
@@ -47,6 +52,7 @@ def add_exclude(app: typer.Typer) -> None:
         session: SessionArgument,
         pm: PmOption = None,
         aim: AimOption = None,
+        point: PointOption = None,
         reason: ReasonOption = "",
         by: ByOption = "",
         quiet: QuietOption = False,
@@ -59,30 +65,28 @@ def add_exclude(app: typer.Typer) -> None:
 
         Try: fgreg exclude SESSION --pm 3 --reason "the fibre was bumped"
         """
-        _record(session, pm, aim, reason, by, include=False, quiet=quiet)
+        _record(session, shot_names(pm, aim, point), reason, by, include=False, quiet=quiet)
 
     @app.command()
     def include(
         session: SessionArgument,
         pm: PmOption = None,
         aim: AimOption = None,
+        point: PointOption = None,
         reason: ReasonOption = "",
         by: ByOption = "",
         quiet: QuietOption = False,
     ) -> None:
         """Take back that shots of a session are left out by hand (fgreg exclude). That is recorded, too."""
-        _record(session, pm, aim, reason, by, include=True, quiet=quiet)
+        _record(session, shot_names(pm, aim, point), reason, by, include=True, quiet=quiet)
 
 
-def _record(
-    session: Path, pm: str | None, aim: str | None, reason: str, by: str, *, include: bool, quiet: bool
-) -> None:
+def _record(session: Path, names: "ShotNames", reason: str, by: str, *, include: bool, quiet: bool) -> None:
     from fgreg.cli.report import clean
     from fgreg.pipeline.exclude import record_choice
 
-    names = shot_names(pm, aim, ("--pm", "--aim"))
-    if not names.pms and not names.aims:
-        raise InputError("--pm and --aim", "nothing", "the PMs or aims that are meant, such as --pm 3,7")
+    if not names:
+        raise InputError("--pm, --aim and --point", "nothing", "the shots that are meant, such as --pm 3,7")
     left = record_choice(session, names, reason=reason, by=by, include=include, warn=warn)
     if quiet:
         return

@@ -225,6 +225,9 @@ def solve(
     without_aim: Annotated[
         str | None, typer.Option("--without-aim", metavar="N,N", help="Leave out these aims, counted from 0.")
     ] = None,
+    without_point: Annotated[
+        str | None, typer.Option("--without-point", metavar="N,N", help="Leave out these known points, from 0.")
+    ] = None,
     certify: Annotated[
         bool,
         typer.Option("--certify", help="Prove that no other registration explains the pairs (up to some seconds)."),
@@ -241,7 +244,7 @@ def solve(
     from fgreg.pipeline.solve import SolveRequest, solve_session
 
     config = solve_config(limit_mm, estimate, certify=certify)
-    without = shot_names(without_pm, without_aim, ("--without-pm", "--without-aim"))
+    without = shot_names(without_pm, without_aim, without_point, "--without-")
     warn_of_leftovers(session, out, rrd)
     with _progress(quiet or as_json) as progress:
         report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves, without), config, progress)

@@ -404,12 +404,16 @@ def _aims(aims: Sequence[AimEstimate]) -> Iterator[RenderableType]:
 def _points(points: Sequence[PointEstimate]) -> Iterator[RenderableType]:
     if not points:
         return
-    nis = [point.nis for point in points if point.nis is not None]
     text = f"Known points: {sum(point.used for point in points)} of {len(points)} used as data"
-    yield text + (f", nis against the other shots {max(nis):.1f} at most (three degrees of freedom)" if nis else "")
-    for point in points:
+    nis, number = max(
+        ((point.nis or 0.0, number) for number, point in enumerate(points) if point.used), default=(0, -1)
+    )
+    if number >= 0:
+        text += f", nis against the other shots {nis:.1f} at most (point {number}, three degrees of freedom)"
+    yield text
+    for number, point in enumerate(points):
         if not point.used:
-            yield bullet(f"known point, {point.t:.1f} s, not used: {point.reason}")
+            yield bullet(f"known point {number}, {point.t:.1f} s, not used: {point.reason}")
 
 
 def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:

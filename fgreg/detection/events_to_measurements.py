@@ -84,7 +84,7 @@ class ExtractedMeasurements:
         marker_noise, board_noise: pooled corner noise.
         epoch_of: camera epoch of every event.
         checks: usable checks, by event index.
-        excluded: aims and looks left out by hand. set_aside: their measurements, by event index, where there are any.
+        excluded: shots left out by hand. set_aside: their measurements, by event index, where there are any.
     """
 
     measurements: Measurements
@@ -104,7 +104,7 @@ class ExtractedMeasurements:
     checks: Mapping[int, Check] = field(default_factory=dict)
     excluded: tuple[ExcludedShot, ...] = ()
     refused: tuple[str, ...] = ()
-    set_aside: Mapping[int, Aim | Pair] = field(default_factory=dict)
+    set_aside: Mapping[int, Aim | Pair | KnownPoint] = field(default_factory=dict)
 
 
 def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
@@ -141,7 +141,7 @@ def extract_measurements(
         redetect,
     )
     starts, epoch_of = number_epochs(events)
-    set_aside: dict[int, Aim | Pair] = {}
+    set_aside: dict[int, Aim | Pair | KnownPoint] = {}
     for index, event in enumerate(events):
         if event.line not in refused:
             builder.add(index, event, epoch_of[index])
@@ -286,8 +286,10 @@ class _Builder:
         self.tracks.append(Track(event.t, epoch, marker, tuple(looks), scan))
         self.track_events.append(index)
 
-    def take_out(self, index: int) -> dict[int, Aim | Pair]:
-        """Take out what the event just added gave: its aim or pair by its index, or nothing."""
+    def take_out(self, index: int) -> dict[int, Aim | Pair | KnownPoint]:
+        """Take out what the event just added gave: its measurement by its index, or nothing."""
+        if index in self.points:
+            return {index: self.points.pop(index)}
         for events, measured in ((self.aim_events, self.aims), (self.pair_events, self.pairs)):
             if events and events[-1] == index:
                 return {events.pop(): measured.pop()}

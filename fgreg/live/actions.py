@@ -158,9 +158,10 @@ class TakeAim:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TakeCheck:
-    """Record a check: a point's pixels in both frames, its x and range, and the angle of the plane that it is in."""
+class TakePoint:
+    """Record a point as a check or as data: its pixels in both frames, x and range, and the angle of its plane."""
 
+    kind: CommandKind
     point: tuple[float, float, float, float, float, float]
     scan_rad: float
 
@@ -214,5 +215,5 @@ class Tell:
 
 
 Action = (
-    Ask | Sweep | Follow | Halt | Release | TakeAim | TakeCheck | TakeChoice | TakeVerify | TakePairs | TakeMove | Tell
+    Ask | Sweep | Follow | Halt | Release | TakeAim | TakePoint | TakeChoice | TakeVerify | TakePairs | TakeMove | Tell
 )

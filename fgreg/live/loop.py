@@ -27,10 +27,10 @@ from fgreg.live.actions import (
     Release,
     Sweep,
     TakeAim,
-    TakeCheck,
     TakeChoice,
     TakeMove,
     TakePairs,
+    TakePoint,
     TakeVerify,
     Tell,
 )
@@ -44,7 +44,7 @@ from fgreg.live.pace import Pace
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
 from fgreg.live.scope_holder import Holder, HolderMove, HolderSettings
-from fgreg.live.shots import check_event, pair_events, query_event
+from fgreg.live.shots import pair_events, point_event, query_event
 from fgreg.live.stage_commands import Steering
 from fgreg.live.static_tags import StaticTags
 from fgreg.live.status import Devices, Figures, Status
@@ -53,9 +53,11 @@ from fgreg.live.workflow import Stage, Workflow
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.events import (
     CameraMovedEvent,
+    CheckEvent,
     ExcludeEvent,
     IncludeEvent,
     NoteEvent,
+    PointEvent,
 )
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.session_model import SessionModel
@@ -376,8 +378,8 @@ class LiveLoop:
                 self.figures.orders += self._steering.order(action)
             case TakeAim(corner):
                 self._aims.aim(corner)
-            case TakeCheck(point, scan_rad):
-                self._check_point(point, scan_rad)
+            case TakePoint():
+                self._take_point(action)
             case TakePairs(pm, looks):
                 for event in pair_events(pm, one_spot(looks), self._start_s, self._model.stage):
                     self._recorder.hand_over(event)
@@ -403,14 +405,15 @@ class LiveLoop:
         self._text = asked(tell.text, tell.wants)
         self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
 
-    def _check_point(self, point: tuple[float, ...], scan_rad: float) -> None:
-        """Record a check."""
-        event = check_event(self._t(host_now()), point, scan_rad, self._model)
+    def _take_point(self, action: TakePoint) -> None:
+        """Record a check, or a known point."""
+        kind = PointEvent if action.kind is CommandKind.POINT else CheckEvent
+        event = point_event(kind, self._t(host_now()), action.point, action.scan_rad, self._model)
         if isinstance(event, str):
-            self._news(Tell(f"no check: {event}"))
+            self._news(Tell(f"no {action.kind}: {event}"))
             return
         self._recorder.hand_over(event)
-        self._news(Tell("check taken", done=True))
+        self._news(Tell(f"{action.kind} taken", done=True))
 
     def _choose(self, pm: int, by: str, *, include: bool) -> None:
         """Record that a PM is left out by hand, or counts again."""

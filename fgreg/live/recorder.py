@@ -25,6 +25,7 @@ from fgreg.model.events import (
     HandChoice,
     NoteEvent,
     PairEvent,
+    PointEvent,
     TrackEvent,
 )
 from fgreg.model.solve_config import SolveConfig
@@ -39,7 +40,7 @@ AGAIN_S = 5.0
 RESTARTED = "the registration's process had ended; a new one has taken in the recorded events"
 ENGINE_ENDED = "the registration's process has ended and is being restarted: later events are not in the estimate"
 
-Recorded = AimEvent | PairEvent | CameraMovedEvent | CheckEvent | HandChoice | NoteEvent | TrackEvent
+Recorded = AimEvent | PairEvent | PointEvent | CameraMovedEvent | CheckEvent | HandChoice | NoteEvent | TrackEvent
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,19 @@ import math
 
 import numpy as np
 
-from fgreg.detection.check_points import check_measurement
+from fgreg.detection.check_points import check_measurement, known_point
 from fgreg.live.actions import LocatedPulse
 from fgreg.live.merge_looks import Spot
-from fgreg.model.events import CheckEvent, MarkerRecord, OtherRecord, PairEvent, PlaneRecord, TrackEvent, TrusRecord
+from fgreg.model.events import (
+    CheckEvent,
+    MarkerRecord,
+    OtherRecord,
+    PairEvent,
+    PlaneRecord,
+    PointEvent,
+    TrackEvent,
+    TrusRecord,
+)
 from fgreg.model.session_model import SessionModel, StageModel
 
 
@@ -42,13 +51,15 @@ def query_event(looks: list[PairEvent]) -> TrackEvent:
     return TrackEvent(last.t, 0, last.marker, several=tuple(look.trus for look in looks))
 
 
-def check_event(t: float, point: tuple[float, ...], scan_rad: float, model: SessionModel) -> CheckEvent | str:
-    """A check, or why there is none."""
+def point_event(
+    kind: type[CheckEvent] | type[PointEvent], t: float, point: tuple[float, ...], scan_rad: float, model: SessionModel
+) -> CheckEvent | PointEvent | str:
+    """A check or a known point, or why there is none."""
     rig = model.camera
     if rig is None or rig.right is None:
         return "session.yaml has no stereo camera"
     device = math.degrees(model.stage.device_from_scan(scan_rad))
     plane = PlaneRecord(device, point[4], point[5])
-    event = CheckEvent(t, 0, left=np.array(point[:2]), right=np.array(point[2:4]), trus=plane)
-    why = check_measurement(event, 0, model)
+    event = kind(t, 0, left=np.array(point[:2]), right=np.array(point[2:4]), trus=plane)
+    why = known_point(event, 0, model) if isinstance(event, PointEvent) else check_measurement(event, 0, model)
     return why if isinstance(why, str) else event

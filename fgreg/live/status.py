@@ -140,6 +140,7 @@ class Status:
             CommandKind.NEXT: plane is not None and plane.requested is MotionKind.SEARCH,
             CommandKind.MOVED: True,
             CommandKind.CHECK: plane is not None,
+            CommandKind.POINT: plane is not None,
             CommandKind.VERIFY: plane is not None and usable,
             CommandKind.EXCLUDE: bool(recorder.pms - recorder.excluded),
             CommandKind.INCLUDE: bool(recorder.excluded),

@@ -24,10 +24,10 @@ from fgreg.live.actions import (
     StageView,
     Sweep,
     TakeAim,
-    TakeCheck,
     TakeChoice,
     TakeMove,
     TakePairs,
+    TakePoint,
     TakeVerify,
     Tell,
 )
@@ -275,11 +275,11 @@ class Workflow:
             case CommandKind.MOVED:
                 self._search = None
                 return [TakeMove()]
-            case CommandKind.CHECK if command.point is not None:
+            case CommandKind.CHECK | CommandKind.POINT if command.point is not None:
                 if inputs.stage is None or inputs.stage.moving:
                     why = "not there" if inputs.stage is None else "turning"
-                    return [Tell(f"no check: the stage is {why}", answer=True)]
-                return [TakeCheck(command.point, inputs.stage.scan_rad)]
+                    return [Tell(f"no {command.kind}: the stage is {why}", answer=True)]
+                return [TakePoint(command.kind, command.point, inputs.stage.scan_rad)]
             case CommandKind.EXCLUDE | CommandKind.INCLUDE if command.pm is not None:
                 return [TakeChoice(command.pm, command.kind is CommandKind.INCLUDE, command.peer)]
             case CommandKind.VERIFY:

@@ -329,20 +329,22 @@ class SettingsUsed:
 
 @dataclass(frozen=True, slots=True)
 class ExcludedShot:
-    """An aim or a look that was left out by hand."""
+    """An aim, a look or a known point that was left out by hand."""
 
-    type: Annotated[str, Key("aim or pair", Text(allowed=("aim", "pair")))]
+    type: Annotated[str, Key("aim, pair or point", Text(allowed=("aim", "pair", "point")))]
     line: Annotated[int, Key("of the shot, in events.jsonl", Integer(1, 2**31 - 1))]
     t: Annotated[float, Key("of the shot", SECONDS)]
-    pm: Annotated[int | None, Key("of a look; absent for an aim", _COUNT)] = None
-    aim: Annotated[int | None, Key("of an aim: its place among the aims, from 0; absent for a look", _COUNT)] = None
+    pm: Annotated[int | None, Key("of a look", _COUNT)] = None
+    aim: Annotated[int | None, Key("of an aim: its place among the aims, from 0", _COUNT)] = None
+    point: Annotated[int | None, Key("of a known point: its place among the points, from 0", _COUNT)] = None
     reason: Annotated[str, Key("why", brief=True)] = ""
     by: Annotated[str, Key("who decided it", brief=True)] = ""
 
     @property
     def name(self) -> str:
-        """PM or aim, with its number."""
-        return f"aim {self.aim}" if self.pm is None else f"PM {self.pm}"
+        """PM, aim or known point, with its number."""
+        named = (("PM", self.pm), ("aim", self.aim), ("known point", self.point))
+        return next(f"{what} {number}" for what, number in named if number is not None)
 
     @property
     def text(self) -> str:

@@ -331,7 +331,7 @@ class RefusedEvent:
 
 @dataclass(frozen=True, slots=True)
 class _HandChoice:
-    """What ``exclude`` and ``include`` have in common: a PM (all its looks), or the line of one aim or look."""
+    """What ``exclude`` and ``include`` have in common: a PM (all its looks), or the line of one shot."""
 
     JSON_RULES: ClassVar = ({"oneOf": [{"required": ["pm"]}, {"required": ["line"]}]},)
 
@@ -339,7 +339,8 @@ class _HandChoice:
     line: int
     pm: Annotated[int | None, Key("all looks at this PM up to now", Integer(0, 2**31 - 1))] = None
     shot_line: Annotated[
-        int | None, Key("one aim or look instead: its line in this file", Integer(1, 2**31 - 1), name="line")
+        int | None,
+        Key("one aim, look or known point instead: its line in this file", Integer(1, 2**31 - 1), name="line"),
     ] = None
     reason: Annotated[str, Key("why", brief=True)] = ""
     by: Annotated[str, Key("who decided it", brief=True)] = ""

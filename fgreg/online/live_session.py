@@ -162,7 +162,7 @@ class LiveSession:
         self._closures = 0  # loop closures that are recorded
         self._excluded: tuple[ExcludedShot, ...] = ()  # left out by hand
         self._refused: list[str] = []  # why recorded shots, checks and moves were refused
-        self._shots = 0  # aims and pairs in the estimate
+        self._shots = 0  # aims, pairs and known points in the estimate
         self._extractor = MeasurementExtractor(self.journal.model)
 
     @property
@@ -407,6 +407,7 @@ class LiveSession:
                 point = known_point(event, self._feed.epoch, self.journal.model)
                 if isinstance(point, KnownPoint):
                     estimate = self._feed.add(point)
+                    self._shots += 1
             elif isinstance(event, CheckEvent):
                 check = check_measurement(event, self._feed.epoch, self.journal.model)
                 if isinstance(check, Check):

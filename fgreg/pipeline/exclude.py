@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fgreg.errors import InputError
 from fgreg.model.estimate import ExcludedShot
-from fgreg.model.events import AimEvent, Event, ExcludeEvent, IncludeEvent, PairEvent
+from fgreg.model.events import AimEvent, Event, ExcludeEvent, IncludeEvent, PairEvent, PointEvent
 from fgreg.model.excluded_shots import excluded_shots
 from fgreg.schema.problems import numbers_text
 from fgreg.session.journal import Journal
@@ -18,26 +18,30 @@ from fgreg.session.session_reader import Session, read_session
 
 @dataclass(frozen=True, slots=True)
 class ShotNames:
-    """Shots as a user names them: PMs by number, aims by their place among the session's aims, from 0."""
+    """Shots as a user names them: PMs by number, aims and known points by their place among the session's, from 0."""
 
     pms: tuple[int, ...] = ()
     aims: tuple[int, ...] = ()
+    points: tuple[int, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.pms or self.aims or self.points)
 
 
-def without_shots(session: Session, names: ShotNames, options: tuple[str, str]) -> Session:
+def without_shots(session: Session, names: ShotNames, prefix: str) -> Session:
     """The session as if it ended with ``exclude`` events for these shots; its files stay as they are.
 
     Shots that its own events leave out keep the reason of those.
 
-    ``options``: those that named PMs and aims, for messages and reasons.
+    ``prefix``: of the options that named them, for messages and reasons.
 
     Raises:
-        InputError: a PM or an aim that is not there.
+        InputError: a shot that is not there.
     """
     out = excluded_shots(session.events)
     lines = [
         (event.line, option)
-        for pm, of_line, option in _chosen(session.events, names, options)
+        for pm, of_line, option in _chosen(session.events, names, prefix)
         for event in session.events
         if event.line not in out and (event.line == of_line or (isinstance(event, PairEvent) and event.pm == pm))
     ]
@@ -73,7 +77,7 @@ def record_choice(
     ``warn``: told what was wrong with the file, such as a last line that was cut short.
 
     Raises:
-        InputError: a PM or an aim that is not there, or (``include``) not left out; nothing is recorded.
+        InputError: a shot that is not there, or (``include``) not left out; nothing is recorded.
         JournalError: another program records to the session, or the disk fails.
     """
     read_session(folder)  # a session without events gets no file
@@ -85,23 +89,25 @@ def record_choice(
         if include:
             _present("--pm", names.pms, {shot.pm for shot in out}, "a PM that is left out")
             _present("--aim", names.aims, {shot.aim for shot in out}, "an aim that is left out")
+            _present("--point", names.points, {shot.point for shot in out}, "a known point that is left out")
         kind, t = IncludeEvent if include else ExcludeEvent, journal.last_t or 0.0
-        chosen = [kind(t, 0, pm, line, reason, by) for pm, line, _ in _chosen(events, names, ("--pm", "--aim"))]
+        chosen = [kind(t, 0, pm, line, reason, by) for pm, line, _ in _chosen(events, names, "--")]
         events += [journal.append(event).event for event in chosen]
         return tuple(excluded_shots(events).values())
 
 
-def _chosen(
-    events: Sequence[Event], names: ShotNames, options: tuple[str, str]
-) -> list[tuple[int | None, int | None, str]]:
+def _chosen(events: Sequence[Event], names: ShotNames, prefix: str) -> list[tuple[int | None, int | None, str]]:
     """PM or line of each shot that is named, and the option that names it."""
     aims = [event.line for event in events if isinstance(event, AimEvent)]
+    points = [event.line for event in events if isinstance(event, PointEvent)]
     pms = {event.pm for event in events if isinstance(event, PairEvent)}
-    _present(options[0], names.pms, pms, "a PM of the session")
-    _present(options[1], names.aims, set(range(len(aims))), "an aim of the session, counted from 0")
+    _present(f"{prefix}pm", names.pms, pms, "a PM of the session")
+    _present(f"{prefix}aim", names.aims, {*range(len(aims))}, "an aim of the session, counted from 0")
+    _present(f"{prefix}point", names.points, {*range(len(points))}, "a known point of the session, counted from 0")
     return [
-        *((pm, None, options[0]) for pm in dict.fromkeys(names.pms)),
-        *((None, aims[aim], options[1]) for aim in dict.fromkeys(names.aims)),
+        *((pm, None, f"{prefix}pm") for pm in dict.fromkeys(names.pms)),
+        *((None, aims[aim], f"{prefix}aim") for aim in dict.fromkeys(names.aims)),
+        *((None, points[point], f"{prefix}point") for point in dict.fromkeys(names.points)),
     ]
 
 

@@ -288,7 +288,7 @@ class _Player:
                 self._add_ms.append(elapsed_ms)
                 self._estimate = estimate or self._estimate
                 noticed = self._feed.noticed > before
-                self._shots += isinstance(event, AimEvent | PairEvent)
+                self._shots += isinstance(event, AimEvent | PairEvent | PointEvent)
             except EventRefused as error:
                 refused = self._unused[index] = error.reason
         return ReplayStep(event, 0, 0, self.estimate, answer, refused, elapsed_ms, noticed)

@@ -144,7 +144,7 @@ def solve_session(
     config = config or SolveConfig()
     result_path = result_place(request.folder, request.out, request.rrd)
     session, inputs = read_with_hashes(request.folder)
-    session = without_shots(session, request.without, ("--without-pm", "--without-aim"))
+    session = without_shots(session, request.without, "--without-")
     session = with_tag_moves(session) if request.detect_moves else session
     truth = read_ground_truth(request.folder)
     with open_viewer(request.rrd, session.model.name, made_from=inputs) as viewer:
@@ -238,7 +238,8 @@ def move_conditions(found: EpochsFound, split: Measurements) -> list[Condition]:
 def hand_conditions(extracted: ExtractedMeasurements) -> list[Condition]:
     """Conditions of the verdict from shots that were left out by hand, and from refused events."""
     shots = extracted.measurements
-    return by_hand(extracted.excluded, len(shots.aims) + len(shots.pairs)) + refused_shots(extracted.refused)
+    used = len(shots.aims) + len(shots.pairs) + len(shots.points)
+    return by_hand(extracted.excluded, used) + refused_shots(extracted.refused)
 
 
 def detection_conditions(extracted: ExtractedMeasurements) -> list[Condition]:

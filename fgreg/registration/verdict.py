@@ -209,13 +209,15 @@ def by_hand(excluded: Sequence[ExcludedShot], used: int) -> list[Condition]:
 
     Args:
         excluded: all that were left out.
-        used: aims and looks that were not, and that were measured.
+        used: aims, looks and known points that were not, and that were measured.
     """
     if not excluded:
         return []
     pms = {shot.pm for shot in excluded if shot.pm is not None}
     aims = {shot.aim for shot in excluded if shot.aim is not None}
-    names = [f"{what} {numbers_text(some)}" for what, some in (("PM", pms), ("aim", aims)) if some]
+    points = {shot.point for shot in excluded if shot.point is not None}
+    numbers = (("PM", pms), ("aim", aims), ("known point", points))
+    names = [f"{what} {numbers_text(some)}" for what, some in numbers if some]
     count = len(excluded)
     text = (
         f"{count} of {count + used} shots {'was' if count == 1 else 'were'} left out by hand ({'; '.join(names)}): no "

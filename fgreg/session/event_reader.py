@@ -52,7 +52,7 @@ class ShotsSeen:
 
     Attributes:
         last: time and line of the last event with a time, None before the first.
-        pms: of the looks. lines: of the aims and looks.
+        pms: of the looks. lines: of the aims, looks and known points.
     """
 
     last: tuple[float, int] | None = None
@@ -62,7 +62,7 @@ class ShotsSeen:
     def add(self, event: Event) -> None:
         """One more event."""
         self.last = (event.t, event.line)
-        if isinstance(event, AimEvent | PairEvent):
+        if isinstance(event, AimEvent | PairEvent | PointEvent):
             self.lines.add(event.line)
         if isinstance(event, PairEvent):
             self.pms.add(event.pm)
@@ -72,7 +72,7 @@ class ShotsSeen:
         if event.pm is not None and event.pm not in self.pms:
             return Problem(("pm",), str(event.pm), f"the PM of an earlier pair: {numbers_text(self.pms)}")
         if event.shot_line is not None and event.shot_line not in self.lines:
-            return Problem(("line",), str(event.shot_line), "the line of an earlier aim or pair")
+            return Problem(("line",), str(event.shot_line), "the line of an earlier aim, pair or point")
         return None
 
 
