@@ -22,7 +22,17 @@ from fgreg.html_report.contents import Source, contents
 from fgreg.html_report.render import render
 from fgreg.html_report.viewer_3d import viewer_of
 from fgreg.html_report.words import ANSWER, PERMITS
-from fgreg.model.estimate import AimEstimate, SessionEstimate, SettingsUsed, TargetEstimate, TrackEstimate, Verdict
+from fgreg.model.estimate import (
+    AimEstimate,
+    PairEstimate,
+    PointEstimate,
+    SessionEstimate,
+    SettingsUsed,
+    TargetEstimate,
+    TrackEstimate,
+    Verdict,
+)
+from fgreg.model.events import MarkerRecord, PairEvent, TrusRecord
 from fgreg.pipeline.html_report import ReportRequest, report_session
 from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.session.result_file import read_result
@@ -165,6 +175,32 @@ def test_it_says_of_which_camera_epoch_its_figures_are_and_numbers_the_aims() ->
     assert "All of camera epoch 1, the last one" in said[1]
     assert "Yes" not in said[1]  # an epoch's own verdict does not answer whether the probe may be turned
     assert "1 7.5 \u2013 \u2013 \u2013 not used left out by hand" in said[1]
+
+
+def test_it_shows_known_points_and_how_far_visible_spots_are_from_their_pms() -> None:
+    source = a_source(Verdict.WARNING)
+    assert "known point" not in render(contents(source))
+    far = np.array([12.0, -0.5, 0.0])
+    points = (
+        PointEstimate(3.0, 0, used=True, error_mm=far / 30.0, nis=2.1),
+        PointEstimate(4.0, 0, used=True, error_mm=far, nis=140.0),
+        PointEstimate(5.0, 0, used=False, reason="left out by hand: the echo of a clip"),
+    )
+    pairs = (
+        PairEstimate(1.0, 7, 0, used=False, reason="outlier", spot_error_mm=far / 4.0),
+        PairEstimate(2.0, 8, 0, used=False),
+    )
+    trus = TrusRecord(0.0, 0.0, 30.0)
+    events = tuple(PairEvent(pair.t, 0, pair.pm, MarkerRecord(np.eye(4)), trus) for pair in pairs)
+    estimate = replace(source.estimate, points=points, pairs=pairs)
+    html = render(contents(replace(source, estimate=estimate, events=events)))
+    text = " ".join(" ".join(Page(html).texts).split())
+    assert "2 of 3 known points are used" in text
+    assert "0 3.0 (0.40, -0.02, 0.00) 0.40 2.1 used" in text
+    assert "1 4.0 (12.00, -0.50, 0.00) 12.01 140.0 used, contradicts the others" in text
+    assert "2 5.0 \u2013 \u2013 \u2013 not used left out by hand: the echo of a clip" in text
+    assert "where the PM is, less where the camera sees it" in text
+    assert "(3.0, -0.1, 0.0)" in text
 
 
 def test_without_a_registration_it_says_so() -> None:

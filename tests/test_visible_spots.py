@@ -14,6 +14,7 @@ from fgreg.errors import InputError
 from fgreg.geometry.transforms import inverse, transform_points
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.readout import read_pairs
 from fgreg.registration.register import register
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.config import SimulationConfig, Sweep
@@ -66,6 +67,14 @@ def test_a_highlight_taken_for_the_spot_is_an_outlier(tmp_path: Path) -> None:
     model, extracted = read(tmp_path, made)
     found = register(extracted.measurements, model, SolveConfig())
     assert np.flatnonzero(~found.shots.pm_inlier).tolist() == [4]
+    square = []
+    for estimate, pair in zip(
+        read_pairs(extracted.measurements, found, model, 0.0), extracted.measurements.pairs, strict=True
+    ):
+        assert estimate.spot_error_mm is not None
+        assert pair.spot is not None
+        square.append(estimate.spot_error_mm @ np.linalg.solve(pair.spot.covariance, estimate.spot_error_mm))
+    assert max(square[:4] + square[5:]) < 20.0 < 0.1 * square[4]
 
 
 def test_pixels_need_two_cameras(tmp_path: Path) -> None:

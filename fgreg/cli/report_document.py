@@ -167,6 +167,7 @@ def _pair_dict(pair: PairEstimate, model: SessionModel, look: Look | None) -> di
         "trus_p_pm_mm": None if pair.trus_p_pm_mm is None else [_plain(value) for value in pair.trus_p_pm_mm],
         "covariance": _rows(pair.covariance),
         "residual_mm": _plain(pair.residual_mm),
+        "spot_error_mm": None if pair.spot_error_mm is None else [_plain(value) for value in pair.spot_error_mm],
         "nis": _plain(pair.nis),
         "nis_dof": pair.nis_dof,
         "influence_mm": _plain(pair.influence_mm),

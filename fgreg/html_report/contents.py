@@ -21,6 +21,7 @@ from fgreg.model.estimate import EpochEstimate, PairEstimate, SessionEstimate, S
 from fgreg.model.events import CameraMovedEvent, Event, NoteEvent, PairEvent, RefusedEvent, StageEvent
 from fgreg.model.session_model import SessionModel
 from fgreg.model.systematic import TEXTS, largest_causes
+from fgreg.registration.known_points import nis_limit
 
 MOST_PAIRS = 400
 """Looks listed; of more the unused ones and those with the largest NIS."""
@@ -73,6 +74,7 @@ def contents(source: Source) -> Row:
         "registration": _registration(source),
         "tracks": _tracks(source),
         "pairs": _pairs(source),
+        "points": _points(source),
         "calibration": _calibration(source),
         "moves": _moves(source),
         "log": _log(source),
@@ -269,6 +271,7 @@ def _pairs(source: Source) -> Row:
                 "sweep": {1: "up", -1: "down", 0: words.NOTHING}[event.trus.sweep],
                 "lambda": number(pair.lambda_mm, 1),
                 "residual": number(pair.residual_mm, 3),
+                "spot": words.NOTHING if pair.spot_error_mm is None else vector(pair.spot_error_mm.tolist(), 1),
                 "nis": number(pair.nis, 1),
                 "bound": number(_bound(pair), 1),
                 "influence": number(pair.influence_mm),
@@ -283,7 +286,32 @@ def _pairs(source: Source) -> Row:
         "used": sum(pair.used for pair in pairs),
         "several": len(source.estimate.epochs) > 1,
         "pictures": bool(source.pictures),
+        "spots": any(pair.spot_error_mm is not None for pair in pairs),
     }
+
+
+def _points(source: Source) -> Row:
+    points = source.estimate.points
+    limit = nis_limit(points)
+    rows = []
+    for place, point in enumerate(points):
+        fits = point.nis is None or point.nis <= limit
+        kind, word = ("ok", "used") if fits else ("warning", "used, contradicts the others")
+        rows.append(
+            {
+                "number": place,
+                "epoch": point.epoch,
+                "t": number(point.t, 1),
+                "used": point.used,
+                "error": words.NOTHING if point.error_mm is None else vector(point.error_mm.tolist()),
+                "length": number(None if point.error_mm is None else float(np.linalg.norm(point.error_mm))),
+                "nis": number(point.nis, 1),
+                "kind": kind if point.used else "refused",
+                "word": word if point.used else "not used",
+                "reason": point.reason,
+            }
+        )
+    return {"rows": rows, "used": sum(point.used for point in points), "limit": number(limit, 1)}
 
 
 def _first_looks(source: Source) -> list[PairEstimate]:

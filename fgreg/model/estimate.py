@@ -216,6 +216,10 @@ class PairEstimate:
             _COUNT,
         ),
     ] = None
+    spot_error_mm: Annotated[
+        FloatArray | None,
+        Key("the PM, less where the camera sees its spot, where the pair has one; camera axes", Numbers(3, _SIZE)),
+    ] = None
     influence_mm: Annotated[
         float | None,
         Key(

@@ -50,9 +50,14 @@ def read_points(
     return tuple(out)
 
 
+def nis_limit(points: Sequence[PointEstimate]) -> float:
+    """NIS from which a point contradicts the other shots."""
+    return float(chdtri(3, CONTRADICTS_P / max(sum(point.nis is not None for point in points), 1)))
+
+
 def point_conditions(points: Sequence[PointEstimate], measurements: Measurements) -> list[Condition]:
     """Warnings of points that are not where the other shots have them."""
-    limit, found = float(chdtri(3, CONTRADICTS_P / max(len(points), 1))), []
+    limit, found = nis_limit(points), []
     for point, measured in zip(points, measurements.points, strict=True):
         if point.error_mm is None or point.nis is None or point.nis <= limit:
             continue

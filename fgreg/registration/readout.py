@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.geometry.rig import Constant
-from fgreg.geometry.transforms import exp_so3, make_transform, rotation_to_direction
+from fgreg.geometry.transforms import exp_so3, inverse, make_transform, rotation_to_direction, transform_points
 from fgreg.graph.reduced_blocks import expected_rotation
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.estimate import AimEstimate, LaserEstimate, PairEstimate
-from fgreg.model.measurements import Measurements
+from fgreg.model.measurements import Measurements, visible_spots
 from fgreg.model.sensitivity import wrap_angle
 from fgreg.model.session_model import SessionModel
 from fgreg.registration.outliers import pm_degrees_of_freedom
@@ -90,6 +90,8 @@ def read_pairs(
     radius = problem.radius_mm + float(state.constant(Constant.RADIUS)[0])
     expected = expected_rotation(problem, state)[0]
     equations = pm_degrees_of_freedom(problem)
+    spots = {shot: spot.camera_p_mm for shot, spot in visible_spots(measurements.pairs).items()}
+    camera_T_trus = [inverse(state.trus_T_camera(place)[0]) for place in range(len(registration.epochs))]
     out: list[PairEstimate] = []
     look = 0
     for pair in measurements.pairs:
@@ -98,6 +100,7 @@ def read_pairs(
             out.append(PairEstimate(pair.t, pair.pm, pair.epoch, used=False, reason=reason))
             continue
         pm, scan = int(problem.look_pm[look]), float(looks.scan_rad[look])
+        place, spot = registration.epochs.index(pair.epoch), spots.get((pair.pm, pair.marker.id))
         dy = float(points[pm, 1]) - radius * np.sin(scan)
         dz = float(points[pm, 2]) - radius * np.cos(scan)
         delta = float(wrap_angle(np.arctan2(dy, dz) - scan))
@@ -117,6 +120,7 @@ def read_pairs(
                 residual_mm=float(np.hypot(*at.look_residual[0, look, :2])),
                 nis=float(nis[pm]),
                 nis_dof=int(equations[pm]),
+                spot_error_mm=None if spot is None else transform_points(camera_T_trus[place], points[pm]) - spot,
             )
         )
         look += 1
