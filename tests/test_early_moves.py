@@ -5,7 +5,6 @@ Refused or a warning while pairs of both sides are mixed, then found, and never 
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cache
 
@@ -23,10 +22,10 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.events import events_in_order
-from fgreg.registration.move_doubt import MoveDoubt, move_doubt, moves_in_epoch, outliers_in_a_row
+from fgreg.registration.move_doubt import move_doubt, moves_in_epoch, outliers_in_a_row
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
-from fgreg.registration.verdict import ABOUT_EVEN, CLEARLY_MOVED, FEW_PMS, MOST_WRONG, possible_camera_move
+from fgreg.registration.verdict import MOST_WRONG
 from tests.camera_move_cases import move_case, moved_session
 from tests.forward import Truth, make_measurements
 from tests.online_streams import unreported_move
@@ -149,27 +148,6 @@ def test_without_an_estimate_there_is_nothing_to_test() -> None:
 def test_screening_passes_over_a_steady_epoch() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(41), pairs=14)
     assert find_camera_move(move_case(measurements, model), model, SolveConfig()) is None
-
-
-@pytest.mark.parametrize(
-    ("log_odds", "pms", "wrong", "verdicts"),
-    [
-        (math.log(7 * ABOUT_EVEN) - 0.1, 8, 0.0, []),
-        (math.log(7 * ABOUT_EVEN) + 0.1, 8, 0.0, [Verdict.WARNING]),
-        (math.log(7 * ABOUT_EVEN) + 0.1, 12, 0.0, []),
-        (math.log(7 * ABOUT_EVEN) + 0.1, 5, 0.0, []),
-        (math.log(7 * ABOUT_EVEN) - 0.1, 8, MOST_WRONG + 0.001, []),
-        (math.log(7 * ABOUT_EVEN) + 0.1, 8, MOST_WRONG + 0.001, [Verdict.REFUSED]),
-        (math.log(FEW_PMS * ABOUT_EVEN) + 0.1, FEW_PMS + 1, 0.0, []),
-        (math.log(FEW_PMS * CLEARLY_MOVED) + 0.1, FEW_PMS + 1, 0.0, [Verdict.WARNING]),
-        (ALARM + 0.1, 5, 0.0, [Verdict.WARNING]),
-        (ALARM + 0.1, FEW_PMS + 1, MOST_WRONG + 0.001, [Verdict.REFUSED]),
-    ],
-)
-def test_odds_of_a_move_become_a_verdict(log_odds: float, pms: int, wrong: float, verdicts: list[Verdict]) -> None:
-    found = possible_camera_move(MoveDoubt(log_odds, 3, 4, pms, wrong), 3.0)
-    assert [condition.verdict for condition in found] == verdicts
-    assert all("up to PM 3 and those from PM 4" in condition.text for condition in found)
 
 
 @pytest.mark.parametrize(

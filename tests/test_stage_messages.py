@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgreg.model.session_model import StageModel
 from fgreg.schema.limits import STAGE_TEXT
 from fgreg.stage.limits import MotionKind, MotionLimits
 from fgreg.stage.messages import (
@@ -24,7 +23,7 @@ from fgreg.stage.messages import (
     decode,
     encode,
 )
-from tests.test_stage_safety_gate import LIMITS, STAGE
+from tests.test_stage_safety_gate import LIMITS
 
 
 def test_messages_come_back_as_they_went() -> None:
@@ -79,19 +78,6 @@ def test_line_that_is_no_message_is_none(line: bytes) -> None:
 def test_garbage_never_becomes_a_message(line: bytes) -> None:
     with pytest.raises(MessageError):
         decode(line)
-
-
-def test_limits_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(ValueError, match="leaves the stage's limits"):
-        MotionLimits.of_session(STAGE, sweep_rad=(-1.5, 0.0))
-    with pytest.raises(ValueError, match="zero position"):
-        MotionLimits.of_session(StageModel(0.1, (0.5, 1.0)))
-    with pytest.raises(ValueError, match="heartbeat_s"):
-        MotionLimits.of_session(STAGE, heartbeat_s=math.inf)
-    with pytest.raises(ValueError, match="overspeed"):
-        MotionLimits.of_session(STAGE, overspeed=0.9)
-    with pytest.raises(ValueError, match="the lower end"):
-        MotionLimits.of_session(STAGE, sweep_rad=(0.1, 0.0))
 
 
 def test_limits_survive_being_handed_over() -> None:

@@ -42,25 +42,30 @@ PARTS = {
         (
             "factors/adapter.py",
             "factors/epoch_change.py",
+            "factors/known_point.py",
             "factors/marker_pose.py",
             "factors/point_on_arc.py",
             "factors/point_on_line.py",
             "factors/rig.py",
             "factors/sensitivity_prior.py",
+            "factors/visible_spot.py",
         ),
         (
             "tests/test_factor_adapter.py",
             "tests/test_factor_epoch_change.py",
+            "tests/test_factor_known_point.py",
             "tests/test_factor_marker_pose.py",
             "tests/test_factor_point_on_arc.py",
             "tests/test_factor_point_on_line.py",
             "tests/test_factor_rig.py",
             "tests/test_factor_sensitivity_prior.py",
+            "tests/test_factor_visible_spot.py",
         ),
     ),
     "gate": Part(
         ("fgreg/stage/safety_gate.py", "fgreg/stage/limits.py"),
         (
+            "tests/test_stage_gate_limits.py",
             "tests/test_stage_safety_gate.py",
             "tests/test_stage_messages.py",
             "tests/test_stage_safety_gate_properties.py",
@@ -68,7 +73,7 @@ PARTS = {
     ),
     "verdict": Part(
         ("fgreg/registration/verdict.py",),
-        ("tests/test_verdict_hypotheses.py", "tests/test_verdict_refusals.py"),
+        ("tests/test_verdict_limits.py", "tests/test_verdict_hypotheses.py", "tests/test_verdict_refusals.py"),
     ),
 }
 ARITHMETIC = {"Add": "Sub", "Sub": "Add", "Mul": "Div", "Div": "Mul", "Mod": "Add", "Pow": "Mul", "FloorDiv": "Mul"}
