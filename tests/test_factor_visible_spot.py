@@ -63,11 +63,11 @@ def test_by_hand() -> None:
     assert by_rig[2][Constant.CAMERA_SCALE] == -40.0
 
 
-def test_the_depth_counts_less_than_what_lies_across() -> None:
+def test_the_depth_counts_less_than_what_lies_across_with_constants_as_declared() -> None:
     values = gtsam.Values()
     values.insert(POSE, gtsam.Pose3())
     values.insertPoint3(POINT, np.array([0.0, 1.0, 103.0]))
-    factor = visible_spot_factor(POSE, POINT, np.array([0.0, 0.0, 100.0]), np.diag([0.25, 0.25, 9.0]), NO_GAIN)
+    factor = visible_spot_factor(POSE, POINT, np.array([0.0, 0.0, 100.0]), np.diag([0.25, 0.25, 9.0]), NO_GAIN + 5.0)
     np.testing.assert_allclose(whitened_error(factor, values), [0.0, 2.0, 1.0], atol=1e-12)
 
 
