@@ -16,10 +16,11 @@ from typer.testing import CliRunner
 from fgreg.certificate.bound import Intervals, first_intervals, lower_bounds, sharper_bounds
 from fgreg.certificate.certify import Certificate, certify, cost_at
 from fgreg.certificate.conditional import Conditional, Looks, conditional
-from fgreg.certificate.rotations import Cells
-from fgreg.certificate.search import farthest, narrowed
+from fgreg.certificate.linearised import linearised, middle, remainder
+from fgreg.certificate.rotations import Cells, Reach
+from fgreg.certificate.search import narrowed
 from fgreg.cli.main import app
-from fgreg.geometry.transforms import FloatArray, exp_so3
+from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, log_so3
 from fgreg.graph.reduced_graph import contributions, private_at, refine
 from fgreg.graph.reduced_solver import optimize
 from fgreg.model.estimate import Verdict
@@ -96,9 +97,12 @@ def _best_fit(of: Conditional, rotation: FloatArray, shift: FloatArray | None) -
     return *unpacked(found.x), float(2.0 * found.cost) + of.constant
 
 
+SHARP = NoiseModel((0.001, 0.001, 0.002), (5e-5, 5e-5, 5e-5), 0.0, (0.3, 0.3, 0.1), 0.24, 0.16)
+"""Of detected frames: lines sharper than looks."""
 CASES: dict[str, dict[str, Any]] = {
     "first hit": {"pairs": 8},
     "window only, tilted array": {"pairs": 8, "first_hit": False, "tilt_rad": 0.03},
+    "sharp lines": {"pairs": 8, "first_hit": False, "noise_model": SHARP},
     "three looks, one shot": {"pairs": 6, "looks_per_pm": 3, "share_marker": True, "tilt_rad": 0.03},
     "two looks, own shots": {"pairs": 6, "looks_per_pm": 2},
 }
@@ -108,7 +112,7 @@ CASES: dict[str, dict[str, Any]] = {
 def test_the_cost_is_that_of_the_reduced_graph(case: str) -> None:
     # A marker that is known to turn by nothing: the graph's weights do not depend on where along a beam the PM is.
     exact = NoiseModel(marker_rotation_rad=(1e-7, 1e-7, 1e-7))
-    found = _registered(3, **CASES[case], noise_model=exact)
+    found = _registered(3, **(CASES[case] | {"noise_model": exact}))
     of, rng, state = _conditional(found), np.random.default_rng(0), found.optimum.state
     for size in (0.0, 0.01, 0.05):
         turned = state.rotation[0, 0] @ exp_so3(size * rng.normal(size=3))
@@ -122,47 +126,100 @@ def test_the_cost_is_that_of_the_reduced_graph(case: str) -> None:
         assert cost == pytest.approx(expected, rel=1e-3, abs=1e-6)
 
 
+def _cells(count: int, rng: np.random.Generator) -> Reach:
+    """Balls and boxes, some thin, as cells have them."""
+    about = 10.0 ** rng.uniform(-3.0, 0.0, count) * 10.0 ** (
+        rng.uniform(-1.5, 0.0, (3, count)) * rng.integers(0, 2, count)
+    )
+    corner = np.linalg.norm(about, axis=0)
+    return Reach(about, np.where(rng.random(count) < 0.5, corner, np.maximum(0.6 * corner, about.max(axis=0))))
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_no_bound_of_a_cell_is_above_the_cost_of_a_registration_in_it(case: str) -> None:
     of, rng, cells = _conditional(_registered(5, **CASES[case])), np.random.default_rng(1), 150
     for away in (0.0, 0.02, 0.1, 1.0):
         rotation = of.rotation @ exp_so3(away * rng.normal(size=3))
         shift, polar, cost = _best_fit(of, rotation, None)
-        reach = 10.0 ** rng.uniform(-3.0, 0.0, cells)
-        turn = rng.normal(size=(cells, 3))
-        turn *= (reach * rng.uniform(size=cells) ** 0.1 / np.linalg.norm(turn, axis=1))[:, None]
-        centres = np.stack([rotation @ exp_so3(-step) for step in turn], axis=-1)
+        within = _cells(cells, rng)
+        turn = (
+            within.about.T
+            * rng.choice([-1.0, 1.0], (cells, 3))
+            * rng.uniform(size=(cells, 3)) ** rng.choice([0.1, 1.0], (cells, 1))
+        )
+        turn *= np.minimum(within.angle / np.linalg.norm(turn, axis=1), 1.0)[:, None]
+        centres = np.stack([exp_so3(-step) @ rotation for step in turn], axis=-1)
         for threshold in (cost + 1e-6, cost + 9.2):
             first = first_intervals(of, threshold)
             assert first is not None
             intervals = Intervals(*(np.repeat(values, cells, axis=-1) for values in (first.centre, first.half)))
-            plain = narrowed(of, centres, reach, intervals, threshold)
-            for found in (plain, sharper_bounds(of, centres, reach, plain, threshold)):
+            plain = narrowed(of, centres, within, intervals, threshold)
+            for found in (plain, sharper_bounds(of, centres, within, plain, threshold)):
                 assert found.possible.all()
                 assert (found.cost <= cost * (1.0 + 1e-6) + 1e-6).all()
                 outside = np.maximum(found.intervals.low - polar[..., None], polar[..., None] - found.intervals.high)
                 assert outside.max() <= 1e-6
-                off = np.concatenate([turn.T - found.turn, shift[:, None] - found.shift]).T
+                off = np.concatenate([turn.T - found.turn, np.einsum("ijb,j->ib", centres, shift) - found.shift]).T
                 ellipsoid = found.moved.transpose(2, 0, 1) + 1e-12 * np.eye(6)
                 assert (np.einsum("bi,bi->b", off, np.linalg.solve(ellipsoid, off[..., None])[..., 0]) < 1.001).all()
+
+
+def _point(of: Conditional, polar: FloatArray) -> FloatArray:
+    """(3, J, B) TRUS points less the pivot, of polar coordinates (3, J, B)."""
+    q = np.stack([polar[0], polar[1] * np.sin(polar[2]), polar[1] * np.cos(polar[2])])
+    return np.asarray(np.einsum("ijn,jnb->inb", of.from_array, q) + of.origin[..., None])
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("part", [0.25, 0.5])
+def test_what_the_linearisation_leaves_is_within_its_bounds(case: str, part: float) -> None:
+    of, rng, cells = _conditional(_registered(5, **CASES[case])), np.random.default_rng(4), 400
+    z = np.repeat(of.polar[..., None], cells, axis=-1)
+    half = (
+        np.abs(rng.normal(size=z.shape)) * np.array([0.5, 0.5, 0.2])[:, None, None] * 10.0 ** rng.uniform(-2, 0, cells)
+    )
+    centres = np.stack([of.rotation @ exp_so3(rng.normal(size=3)) for _ in range(cells)], axis=-1)
+    for corner in (0.05, 1.0):  # near the corners of cells and intervals, and anywhere
+        reach = _cells(cells, rng)
+        turn = reach.about * rng.choice([-1.0, 1.0], (3, cells)) * rng.uniform(size=(3, cells)) ** corner
+        turn *= np.minimum(reach.angle / np.linalg.norm(turn, axis=0), 1.0)
+        off = half * rng.choice([-1.0, 1.0], (3, 1, cells)) * rng.uniform(size=z.shape) ** corner
+        at = linearised(of, centres, z, half)
+        first = linearised(
+            replace(of, others=of.others.take(np.zeros(0, dtype=np.int64))), centres, z + off, half
+        ).looks
+        within = float(np.sqrt(first.chi2.sum(axis=0).max()))
+        rest = remainder(of, at, z, half, reach, within, part)
+        true = np.einsum("bij,jnb->inb", exp_so3(-turn.T), _point(of, z + off))
+        linear = at.y + np.einsum("iknb,knb->inb", at.by_z, off) + np.cross(at.y, turn[:, None], axis=0)
+        if part < 0.5:
+            linear += middle(at, rest, reach)
+        miss = np.einsum("minb,inb->mnb", at.rows, true - linear)
+        gives = np.einsum("iknb,mknb,mnb->inb", at.spread, at.line[:, :3], miss)
+        assert (np.abs(gives) <= rest.offset * (1.0 + 1e-9) + 1e-12).all()
+        miss -= np.einsum("mknb,knb->mnb", at.line[:, :3], gives)
+        chi2 = np.square(miss).sum(axis=0) + np.einsum("inb,iknb,knb->nb", gives, at.looks.hessian, gives)
+        left = np.sqrt(np.square(np.sqrt(chi2) + np.sqrt(at.looks.error2)).sum(axis=0))
+        assert (left <= rest.error * (1.0 + 1e-9) + 1e-9).all()
+        assert (left > 0.3 * rest.error).any()
 
 
 def test_parallel_beams_bound_neither_the_cost_nor_the_shift() -> None:
     of = _conditional(_registered(5, pairs=8))
     along = np.array([0.6, 0.0, 0.8])
     rows = of.rows - np.einsum("min,i,k->mkn", of.rows, along, along)
-    of = replace(of, rows=rows)
+    of, ball = replace(of, rows=rows), Reach.ball(np.array([0.01]))
     for threshold in (0.5, 1e4):
         first = first_intervals(of, threshold)
         assert first is not None
         assert first.low[1].min() > -1e-9  # no range is negative, whatever its noise
-        plain = lower_bounds(of, of.rotation[..., None], np.array([0.01]), first, threshold)
-        for found in (plain, sharper_bounds(of, of.rotation[..., None], np.array([0.01]), plain, threshold)):
+        plain = lower_bounds(of, of.rotation[..., None], ball, first, threshold)
+        for found in (plain, sharper_bounds(of, of.rotation[..., None], ball, plain, threshold)):
             assert found.possible.all()
             assert found.cost[0] <= of.constant
             assert np.sqrt(found.moved[3, 3, 0]) > 1e6
         unknown = replace(of, offset=np.full_like(of.offset, np.nan))
-        found = lower_bounds(unknown, of.rotation[..., None], np.array([0.01]), first, threshold)
+        found = lower_bounds(unknown, of.rotation[..., None], ball, first, threshold)
         assert found.possible.all()
         assert found.cost[0] == 0.0
     assert not replace(_certify(_registered(11, pairs=10)), within_mm=1e6).is_alone
@@ -170,7 +227,7 @@ def test_parallel_beams_bound_neither_the_cost_nor_the_shift() -> None:
 
 def test_bounds_of_small_cells_come_near_the_cost() -> None:
     of = _conditional(_registered(5, pairs=8))
-    cost, reach = cost_at(of), np.radians([1.0, 0.5])
+    cost, reach = cost_at(of), Reach.ball(np.radians([1.0, 0.5]))
     first = first_intervals(of, cost)
     assert first is not None
     intervals = Intervals(*(np.repeat(values, 2, axis=-1) for values in (first.centre, first.half)))
@@ -183,16 +240,27 @@ def test_bounds_of_small_cells_come_near_the_cost() -> None:
     assert loss[1] < 1e-3 * cost
 
 
+def _holding(cells: Cells, rotation: FloatArray) -> IntArray:
+    """Cells that may hold a rotation: it is as near to their centres as they say that they reach."""
+    turn = log_so3(rotation @ cells.rotation.swapaxes(1, 2))
+    near = (np.abs(turn) <= cells.about_rad).all(axis=1) & (np.linalg.norm(turn, axis=1) <= cells.reach_rad)
+    return np.flatnonzero(near)
+
+
 def test_cells_cover_all_rotations_and_so_do_their_halves() -> None:
     cells, rng = Cells.cover(3), np.random.default_rng(2)
     for _ in range(50):
         rotation = exp_so3(rng.normal(size=3) * 2.0)
-        away = farthest(cells, rotation) - cells.reach_rad
-        inside = np.flatnonzero(away <= cells.reach_rad)
+        inside = cells.take(_holding(cells, rotation))
+        for _ in range(3):
+            assert len(inside)
+            parts, index = inside.halved(rng.random((len(inside), 3)) < 0.5)
+            assert (parts.half <= inside.half[index]).all()
+            inside = parts.take(_holding(parts, rotation))
         assert len(inside)
-        parts = cells.take(inside).halved()
-        assert (farthest(parts, rotation) - parts.reach_rad <= parts.reach_rad).any()
-    assert cells.halved().reach_rad.max() < 0.75 * cells.reach_rad.max()
+    every, _ = cells.halved(np.ones((len(cells), 3), dtype=bool))
+    assert len(every) == 8 * len(cells)
+    assert every.reach_rad.max() < 0.75 * cells.reach_rad.max()
 
 
 def test_the_best_registration_is_certified_and_nothing_is_below_the_bound() -> None:
@@ -207,6 +275,13 @@ def test_the_best_registration_is_certified_and_nothing_is_below_the_bound() -> 
         assert cost >= certificate.least
         angle = 2.0 * math.asin(min(float(np.linalg.norm(rotation - of.rotation)) / math.sqrt(8.0), 1.0))
         assert cost > certificate.cost + 9.2 or angle <= certificate.within_rad
+
+
+def test_windows_alone_prove_the_best_registration_of_sharp_lines() -> None:
+    found = _registered(14, pairs=10, first_hit=False, noise_model=SHARP)
+    certificate = _certify(found)
+    assert certificate.is_least
+    assert certificate.holds_without_pairs
 
 
 def _at_another_minimum(found: Registration, which: int = 1) -> Registration:

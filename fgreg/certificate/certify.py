@@ -16,15 +16,16 @@ The proof is a branch and bound over all rotations (fgreg.certificate.search); r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgreg.certificate.bound import Intervals, lower_bounds
 from fgreg.certificate.conditional import Conditional, conditional
-from fgreg.certificate.rotations import Cells
+from fgreg.certificate.rotations import Cells, Reach
 from fgreg.certificate.search import Found, angle_between, farthest, search
-from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, make_transform
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.shared_state import SharedState
@@ -32,8 +33,10 @@ from fgreg.graph.shared_state import SharedState
 RELATIVE_GAP, LEAST_GAP = 1e-3, 1e-3
 """Gap up to which the minimum counts as proved: relative to the chi square, and at least as much of it (few pairs fit
 exactly, and differences as small are none)."""
-FINE_RAD = np.radians(1.6)
-"""Cells that may hold another registration are halved to this."""
+FINE_RAD = tuple(np.radians([3.0, 1.5]))
+"""Cells that may hold another registration are halved to this; to the next one where they are not near enough else."""
+APART_RAD = tuple(np.radians([3.2, 1.6, 0.8]))
+"""The same with the beam as it is without the pairs."""
 NEAR_RAD = np.radians(10.0)
 """Possible registrations farther than this from the estimate, and from each other, are worth a local search."""
 ABOUT_RAD = np.radians(30.0)
@@ -65,8 +68,8 @@ class Certificate:
     Attributes:
         cost: chi square of its pairs at the estimate. least: no registration has less.
         within_chi2: of the estimate's chi square, for the rest. within_rad, within_mm: see the module.
-        finished: whether the search for others came to its end. regions: number of separate regions of rotations in
-            which they may be (1: about the estimate).
+        finished: whether the search for others came to its end. connected: whether the rotations that they may have
+            then lie about the estimate's and hang together.
         holds_without_pairs: whether, with the beam as it is without the pairs, all registrations that are no worse than
             the one near the estimate are near it as well.
         starts: (n, 4, 4) registrations to start a local search from: far from the estimate, and not excluded.
@@ -79,7 +82,7 @@ class Certificate:
     within_rad: float
     within_mm: float
     finished: bool
-    regions: int
+    connected: bool
     holds_without_pairs: bool
     starts: FloatArray
     looked_at: int
@@ -98,7 +101,7 @@ class Certificate:
     def is_alone(self) -> bool:
         """Whether all others within the threshold are proved to lie about it."""
         about = self.within_rad <= ABOUT_RAD and self.within_mm <= ABOUT_MM
-        return self.finished and self.regions == 1 and about
+        return self.connected and about
 
 
 def tolerance(cost: float) -> float:
@@ -131,46 +134,76 @@ def certify(
     of = conditional(problem, state, private, epoch)
     cost = cost_at(of)
     enough = cost - max(RELATIVE_GAP * cost, LEAST_GAP)
-    others = search(of, cost + within_chi2, reach_rad=FINE_RAD, budget=budget // 8)
+    others = _narrowed_to(of, cost + within_chi2, FINE_RAD, budget // 4, lambda found: _are_about(of, found))
     if others is None:
         return None
     few = others.finished and len(others.region.cells) <= FEW_CELLS
     start = others.region if few else None
-    best = search(of, cost, reach_rad=0.0, budget=3 * budget // 4, enough=enough, start=start)
+    best = search(of, cost, reach_rad=0.0, budget=budget // 2, enough=enough, start=start)
     assert best is not None
-    region = others.region
-    away = farthest(region.cells, of.rotation)
-    labels = _regions(region.cells, of.rotation)
-    starts, looked_at, holds = [_starts(of, others, away)], best.looked_at + others.looked_at, False
+    starts, looked_at, holds = [_starts(of, others, _turned(others))], best.looked_at + others.looked_at, False
     if without_pairs is not None:
         near_by = without_pairs
         there = conditional(problem, near_by.state, near_by.private, epoch, near_by.distance_mm)
-        again = search(there, cost_at(there), reach_rad=2.0 * FINE_RAD, budget=budget // 8)
+        near = _farthest(others) + 2.0 * APART_RAD[0]  # of the minimum there
+        again = _narrowed_to(there, cost_at(there), APART_RAD, budget // 4, lambda found: _farthest(found) <= near)
         assert again is not None
-        far = farthest(again.region.cells, of.rotation)
-        near = float(away.max(initial=0.0)) + angle_between(there.rotation, of.rotation) + 4.0 * FINE_RAD
-        holds = again.finished and bool((far <= near).all())
+        holds = again.finished and _farthest(again) <= near
         looked_at += again.looked_at
-        starts.append(_starts(there, again, far))
+        starts.append(_starts(there, again, farthest(again.region.cells, of.rotation @ there.rotation.T)))
     return Certificate(
         cost=cost,
         least=max(best.least, 0.0),
         within_chi2=within_chi2,
-        within_rad=float(away.max(initial=0.0)),
+        within_rad=_farthest(others),
         within_mm=_shifted(of, others),
         finished=others.finished,
-        regions=int(labels.max(initial=0)) + 1,
+        connected=others.finished and _are_about(of, others),
         holds_without_pairs=holds,
         starts=np.concatenate(starts),
         looked_at=looked_at,
     )
 
 
+def _narrowed_to(
+    of: Conditional, threshold: float, fine: tuple[float, ...], budget: int, are_near: Callable[[Found], bool]
+) -> Found | None:
+    """Search down to each of the sizes ``fine`` until what is left is near enough, or the budget is used up."""
+    found: Found | None = None
+    for reach_rad in fine:
+        used, start = (0, None) if found is None else (found.looked_at, found.region)
+        more = search(of, threshold, reach_rad=reach_rad, budget=budget - used, start=start)
+        if more is None:
+            return None
+        found = replace(more, looked_at=used + more.looked_at)
+        if not found.finished or are_near(found):
+            break
+    return found
+
+
 def cost_at(of: Conditional) -> float:
     """The chi square at the estimate's registration and PMs."""
     point = Intervals(of.polar[..., None], np.full((*of.polar.shape, 1), 1e-12))
-    found = lower_bounds(of, of.rotation[..., None], np.array([1e-12]), point, np.inf)
+    found = lower_bounds(of, of.rotation[..., None], Reach.ball(np.array([1e-12])), point, np.inf)
     return float(found.cost[0])
+
+
+def _are_about(of: Conditional, others: Found) -> bool:
+    """Whether all registrations that are left lie about the estimate, in one region."""
+    near = _farthest(others) <= ABOUT_RAD and _shifted(of, others) <= ABOUT_MM
+    return near and _hang_together(others.region.cells)
+
+
+def _farthest(others: Found) -> float:
+    return float(_turned(others).max(initial=0.0))
+
+
+def _turned(others: Found) -> FloatArray:
+    """(n,) rad: how far from the estimate rotations in each cell are, at most."""
+    cells, bounds = others.region.cells, others.region.bounds
+    spread = np.linalg.eigvalsh(bounds.moved[:3, :3].transpose(2, 0, 1))[:, -1]
+    middle = angle_between(exp_so3(bounds.turn.T) @ cells.rotation, np.eye(3))
+    return np.asarray(np.minimum(farthest(cells), middle + np.sqrt(np.maximum(spread, 0.0))))
 
 
 def _shifted(of: Conditional, others: Found) -> float:
@@ -179,27 +212,22 @@ def _shifted(of: Conditional, others: Found) -> float:
     if not len(bounds.cost):
         return 0.0
     spread = np.linalg.eigvalsh(bounds.moved[3:, 3:].transpose(2, 0, 1))[:, -1]
-    off = np.linalg.norm(bounds.shift - of.shift[:, None], axis=0)
+    centres = others.region.cells.rotation @ of.rotation
+    off = np.linalg.norm(bounds.shift.T - centres @ of.shift, axis=1)
     return float((off + np.sqrt(np.maximum(spread, 0.0))).max())
 
 
-def _regions(cells: Cells, rotation: FloatArray) -> IntArray:
-    """(n,) number of the connected region of each cell, 0 for that of a rotation (3, 3), if any is about it."""
-    from scipy.sparse import coo_matrix  # slow to load
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
-    count = len(cells)
-    if not count:
-        return np.zeros(0, dtype=np.int64)
-    q = cells.quaternion
-    reach = float(cells.reach_rad.max())
-    near = cKDTree(np.concatenate([q, -q])).query_pairs(2.0 * np.sin(0.5 * reach) * (1.0 + 1e-9), output_type="ndarray")
-    pairs = near % count
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    _, labels = connected_components(graph, directed=False)
-    mine = labels[int(np.argmin(farthest(cells, rotation) - cells.reach_rad))]
-    return np.where(labels == mine, 0, np.where(labels < mine, labels + 1, labels))
+def _hang_together(cells: Cells) -> bool:
+    """Whether all cells are connected, through each other, with the one nearest to the estimate."""
+    apart = np.ones(len(cells), dtype=bool)
+    front = np.argsort(farthest(cells) - cells.reach_rad)[:1]
+    while len(front):
+        apart[front] = False
+        left = np.flatnonzero(apart)
+        cosine = np.abs(cells.quaternion[left] @ cells.quaternion[front].T)
+        angle = 2.0 * np.arccos(np.minimum(cosine, 1.0))
+        front = left[(angle <= cells.reach_rad[left, None] + cells.reach_rad[front]).any(axis=1)]
+    return not apart.any()
 
 
 def _starts(of: Conditional, others: Found, away: FloatArray) -> FloatArray:
@@ -213,6 +241,6 @@ def _starts(of: Conditional, others: Found, away: FloatArray) -> FloatArray:
         distance = np.minimum(distance, farthest(cells, cells.rotation[index]) - cells.reach_rad)
     out = np.zeros((len(chosen), 4, 4))
     for row, index in enumerate(chosen):
-        rotation = cells.rotation[index] @ exp_so3(bounds.turn[:, index])
-        out[row] = make_transform(rotation, rotation @ bounds.shift[:, index] + of.pivot)
+        turn, centre = exp_so3(bounds.turn[:, index]), cells.rotation[index] @ of.rotation
+        out[row] = make_transform(turn @ centre, turn @ bounds.shift[:, index] + of.pivot)
     return out

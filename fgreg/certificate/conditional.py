@@ -57,8 +57,9 @@ class Conditional:
         first: the first look of each PM, in the order of PMs. others: all other looks.
         from_array: (3, 3, J), origin: (3, J) TRUS point of a point in the array's frame at the first look, less pivot.
         pivot: (3,) TRUS point near the PMs. radius_mm: of the probe.
-        strength: (J,) by how much a mm in any direction changes the rows, at most. stretch: (J,) largest factor of
-            ``from_array``. plane_sigma_mm: (J,) largest standard deviation of the first look's x and range.
+        scan_rad: (J,) by how much the array is turned at the first look. skew: (J,) how far ``from_array`` is from that
+            turn alone, there and back. stretch: (J,) its largest factor. plane_sigma_mm: (J,) largest standard
+            deviation of the first look's x and range.
         rotation, shift: of the estimate, (3, 3) and s (3,). polar: (3, J) the PMs there.
     """
 
@@ -71,7 +72,8 @@ class Conditional:
     origin: FloatArray
     pivot: FloatArray
     radius_mm: float
-    strength: FloatArray
+    scan_rad: FloatArray
+    skew: FloatArray
     stretch: FloatArray
     plane_sigma_mm: FloatArray
     rotation: FloatArray
@@ -106,6 +108,9 @@ def conditional(
     first = np.array([int(np.flatnonzero(looks.pm == j)[0]) for j in range(len(mine))], dtype=np.int64)
     rest = np.setdiff1d(np.arange(len(looks.pm)), first)
     back = np.asarray(np.linalg.inv(matrix[first]), dtype=np.float64)
+    scan, tilt = turn_of(matrix[first])
+    there, again = (np.linalg.norm(one - np.eye(3), ord=2, axis=(1, 2)) for one in (tilt, np.linalg.inv(tilt)))
+    skew = np.asarray((1.0 + there) * (1.0 + again) - 1.0)
     start = -np.einsum("nij,nj->ni", back, origin[first])
     of_pm = first[looks.pm]
     from_first = matrix @ back[looks.pm]
@@ -125,13 +130,24 @@ def conditional(
         origin=(start - pivot).T,
         pivot=pivot,
         radius_mm=problem.radius_mm + float(state.constants[0, Constant.RADIUS]),
-        strength=np.linalg.norm(rows.transpose(2, 0, 1), ord=2, axis=(1, 2)),
+        scan_rad=scan,
+        skew=skew,
         stretch=np.linalg.norm(back, ord=2, axis=(1, 2)),
         plane_sigma_mm=np.asarray(np.linalg.eigvalsh(looks.weight[:2, :2, first].transpose(2, 0, 1))[:, 0] ** -0.5),
         rotation=rotation,
         shift=rotation.T @ (translation - pivot),
         polar=np.stack([q[0], np.hypot(q[1], q[2]), np.arctan2(q[1], q[2])]),
     )
+
+
+def turn_of(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Angles (n,) about x and rests (n, 3, 3) such that matrices (n, 3, 3) turn by the angle first, and hardly more."""
+    angle = np.arctan2(matrix[:, 2, 1] - matrix[:, 1, 2], matrix[:, 1, 1] + matrix[:, 2, 2])
+    cosine, sine = np.cos(angle), np.sin(angle)
+    back = np.zeros_like(matrix)
+    back[:, 0, 0] = 1.0
+    back[:, 1, 1], back[:, 1, 2], back[:, 2, 1], back[:, 2, 2] = cosine, sine, -sine, cosine
+    return angle, matrix @ back
 
 
 def _lines(

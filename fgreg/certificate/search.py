@@ -13,8 +13,8 @@ import numpy as np
 
 from fgreg.certificate.bound import Bounds, Intervals, first_intervals, lower_bounds, sharper_bounds
 from fgreg.certificate.conditional import Conditional
-from fgreg.certificate.rotations import Cells
-from fgreg.geometry.transforms import FloatArray, IntArray
+from fgreg.certificate.rotations import Cells, Reach
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 
 ALONG = 4
 """Cells along each side of the first cover: 256 cells, of 25 to 47 deg."""
@@ -24,6 +24,10 @@ NARROWED = 0.8
 """Intervals that narrow to more than this part of what they were are not narrowed again."""
 AT_ONCE = 12_000
 """Number of cells times PMs that are bounded in one call: more do not stay in the cache."""
+NEAR = 0.5
+"""Part of the threshold from which on a bound is worth sharpening."""
+MUCH = 0.4
+"""Sides by which the bound gains as much of what it gains by the best one are halved with it."""
 BALLS = np.radians(10.0) * 0.75 ** np.arange(20)
 """Radii about the estimate that are tried as one cell."""
 _NONE = np.zeros(0, dtype=np.int64)
@@ -91,7 +95,7 @@ def search(
     least, looked_at = min(threshold, enough), 0
     kept = [_bounded(of, cells.take(_NONE), intervals.take(_NONE), threshold)]
     while len(cells):
-        outside = np.flatnonzero(farthest(cells, of.rotation) > ball)
+        outside = np.flatnonzero(farthest(cells) > ball)
         cells, intervals = cells.take(outside), intervals.take(outside)
         if not len(cells):
             break
@@ -102,13 +106,13 @@ def search(
         if aside.any():
             least = min(least, float(cost[aside].min()))
         small = left & (region.cells.reach_rad <= reach_rad)
-        if looked_at + 8 * count * int(np.sum(left & ~small)) > budget:
+        split = np.flatnonzero(left & ~small)
+        halves, index = region.cells.take(split).halved(_sides(region.take(split)))
+        if looked_at + count * len(halves) > budget:
             kept.append(region.take(np.flatnonzero(left)))
             break
         kept.append(region.take(np.flatnonzero(small)))
-        split = np.flatnonzero(left & ~small)
-        cells = region.cells.take(split).halved()
-        intervals = _repeated(region.bounds.intervals.take(split), 8)
+        cells, intervals = halves, region.bounds.intervals.take(split[index])
     finished = all((part.cells.reach_rad <= reach_rad).all() for part in kept)
     region = _joined(kept)
     if len(region.cells):
@@ -127,16 +131,16 @@ def _bounded(of: Conditional, cells: Cells, intervals: Intervals, threshold: flo
 
 
 def _portion(of: Conditional, cells: Cells, intervals: Intervals, threshold: float) -> Region:
-    rotation, reach = cells.rotation.transpose(1, 2, 0), cells.reach_rad
+    rotation, reach = np.einsum("nij,jk->ikn", cells.rotation, of.rotation), cells.reach
     bounds = narrowed(of, rotation, reach, intervals, threshold)
+    near = np.flatnonzero(bounds.possible & (bounds.cost > NEAR * threshold))
+    if len(near):
+        bounds.put(near, sharper_bounds(of, rotation[..., near], reach.take(near), bounds.take(near), threshold))
     index = np.flatnonzero(bounds.possible)
-    sharper = sharper_bounds(of, rotation[..., index], reach[index], bounds.take(index), threshold)
-    return Region(cells.take(index), sharper)
+    return Region(cells.take(index), bounds.take(index))
 
 
-def narrowed(
-    of: Conditional, rotation: FloatArray, reach: FloatArray, intervals: Intervals, threshold: float
-) -> Bounds:
+def narrowed(of: Conditional, rotation: FloatArray, reach: Reach, intervals: Intervals, threshold: float) -> Bounds:
     """Bounds of cells, with intervals narrowed as long as that helps."""
     out = lower_bounds(of, rotation, reach, intervals, threshold)
     index = np.arange(len(reach))
@@ -147,7 +151,7 @@ def narrowed(
         if not len(index):
             break
         before = out.intervals.half[2][:, index].sum(axis=0)
-        again = lower_bounds(of, rotation[..., index], reach[index], out.intervals.take(index), threshold)
+        again = lower_bounds(of, rotation[..., index], reach.take(index), out.intervals.take(index), threshold)
         again.cost[:] = np.maximum(again.cost, out.cost[index])
         out.put(index, again)
     return out
@@ -156,15 +160,22 @@ def narrowed(
 def _ball(of: Conditional, known: Intervals, threshold: float, enough: float) -> float:
     """The largest radius about the estimate's rotation that is known to hold no lower cost than ``enough``."""
     rotation = np.repeat(of.rotation[..., None], len(BALLS), axis=-1)
-    bounds = narrowed(of, rotation, BALLS, _repeated(known, len(BALLS)), threshold)
-    bounds = sharper_bounds(of, rotation, BALLS, bounds, threshold)
+    reach = Reach.ball(BALLS)
+    bounds = narrowed(of, rotation, reach, _repeated(known, len(BALLS)), threshold)
+    bounds = sharper_bounds(of, rotation, reach, bounds, threshold)
     good = bounds.cost >= enough
     return float(BALLS[good].max()) if good.any() else 0.0
 
 
-def farthest(cells: Cells, rotation: FloatArray) -> FloatArray:
-    """(n,) rad: the angle between a rotation (3, 3) and any of a cell's, at most."""
-    return np.asarray(angle_between(cells.rotation, rotation) + cells.reach_rad)
+def _sides(region: Region) -> BoolArray:
+    """(n, 3) sides along which cells are halved: those that the bound gains most by."""
+    worth = np.einsum("nik,kn->ni", region.cells.sides_rad, region.bounds.worth)
+    return np.asarray(worth >= MUCH * worth.max(axis=1, keepdims=True))
+
+
+def farthest(cells: Cells, rotation: FloatArray | None = None) -> FloatArray:
+    """(n,) rad: the angle between a turn (3, 3), the reference's if None, and any of a cell's, at most."""
+    return np.asarray(angle_between(cells.rotation, np.eye(3) if rotation is None else rotation) + cells.reach_rad)
 
 
 def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
