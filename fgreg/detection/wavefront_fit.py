@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft as scipy_fft
 
-from fgreg.detection.channels import Band, Baseband, Channels, baseband, phasor
+from fgreg.detection.channels import MIN_RATE_MHZ, Band, Baseband, Channels, Complex64Array, baseband, phasor
 from fgreg.detection.wavefront_search import RATIO_SIGMA
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import BoolArray, FloatArray
@@ -79,8 +79,9 @@ class _Noise:
 
     lag: Complex128Array
 
-    def of(self, functional: Complex128Array) -> float:
+    def of(self, functional: Complex64Array) -> float:
         """Variance of Re <functional, noise>."""
+        functional = functional.astype(np.complex128)
         spread = np.correlate(functional, functional, mode="full")
         middle = functional.size - 1
         lags = self.lag[: functional.size]
@@ -100,7 +101,7 @@ def path_jacobian(x_mm: float, range_mm: float, ratio: float, element_x_mm: Floa
     return np.column_stack([aside / ratio**2 / path, range_mm / path, -(aside**2) / ratio**3 / path])
 
 
-def aligned(signal: Baseband, delay_us: FloatArray, half: int) -> Complex128Array:
+def aligned(signal: Baseband, delay_us: FloatArray, half: int) -> Complex64Array:
     """Channels shifted so that a wave with these arrival times is at the middle of every row.
 
     Args:
@@ -113,7 +114,7 @@ def aligned(signal: Baseband, delay_us: FloatArray, half: int) -> Complex128Arra
     outside = signal.data.shape[0] - 1
     position = (delay_us - signal.start_us) * signal.rate_mhz
     whole = np.floor(position).astype(np.intp)
-    f = (position - whole)[:, None]
+    f = (position - whole)[:, None].astype(np.float32)
     row = whole[:, None] + np.arange(-half - 1, half + 3)[None, :]
     row[(row < 0) | (row > outside)] = outside
     block = signal.data[row, np.arange(delay_us.size)[:, None]]
@@ -124,8 +125,8 @@ def aligned(signal: Baseband, delay_us: FloatArray, half: int) -> Complex128Arra
         (f + 1) * f * (f - 1) / 6,
     )
     width = 2 * half + 1
-    window = sum(tap * block[:, k : k + width] for k, tap in enumerate(taps))
-    return np.asarray(window * np.exp(2j * np.pi * signal.carrier_mhz * (delay_us - signal.start_us))[:, None])
+    turn = np.exp(2j * np.pi * signal.carrier_mhz * (delay_us - signal.start_us)).astype(np.complex64)[:, None]
+    return np.asarray(turn * sum(tap * block[:, k : k + width] for k, tap in enumerate(taps)))
 
 
 def pulse_band(pulse: Complex128Array, noise_power: FloatArray, carrier_mhz: float, rate_mhz: float) -> Band:
@@ -146,7 +147,7 @@ def pulse_band(pulse: Complex128Array, noise_power: FloatArray, carrier_mhz: flo
 
 
 def _gains(
-    window: Complex128Array, pulse: Complex128Array, noise: _Noise, audible: BoolArray, element_x_mm: FloatArray
+    window: Complex64Array, pulse: Complex64Array, noise: _Noise, audible: BoolArray, element_x_mm: FloatArray
 ) -> FloatArray:
     """Amplitude of the pulse in each channel, smoothed along the array; zero where not audible or not significant.
 
@@ -163,8 +164,8 @@ def _gains(
     return np.where(audible & (smooth > SIGNIFICANT * sigma) & (smooth > 0.05 * smooth.max()), smooth, 0.0)
 
 
-def _mean_pulse(window: Complex128Array, gain: FloatArray) -> Complex128Array:
-    return np.asarray(gain @ window / float((gain**2).sum()))
+def _mean_pulse(window: Complex64Array, gain: FloatArray) -> Complex64Array:
+    return np.asarray((gain / float((gain**2).sum())).astype(np.float32) @ window)
 
 
 def _noise_about(signal: Baseband, delay_us: FloatArray, live: BoolArray, guard_us: float, lags: int) -> _Noise:
@@ -180,12 +181,22 @@ def _noise_about(signal: Baseband, delay_us: FloatArray, live: BoolArray, guard_
         return _Noise(flat)
     size = int(scipy_fft.next_fast_len(kept + lags))
     spectrum = scipy_fft.fft(np.where(quiet, signal.data[:kept, channels], 0), size, axis=0)
-    total = np.fft.ifft((np.abs(spectrum) ** 2).sum(axis=1))[:lags]
-    mask = scipy_fft.rfft(quiet.astype(np.float32), size, axis=0)
-    count = np.fft.irfft((np.abs(mask) ** 2).sum(axis=1), size)[:lags]
-    lag = total / np.maximum(count, 1.0)
+    total = np.fft.ifft((np.square(spectrum.real) + np.square(spectrum.imag)).sum(axis=1, dtype=np.float64))[:lags]
+    lag = total / np.maximum(_pairs_of(quiet, lags), 1.0)
     lag[0] = max(lag[0].real, 1e-3 * signal.variance)
     return _Noise(lag)
+
+
+def _pairs_of(quiet: BoolArray, lags: int) -> FloatArray:
+    """Number (lags,) of pairs of quiet samples (samples, channels) this far apart; each channel is loud once."""
+    samples, loud = len(quiet), np.count_nonzero(~quiet, axis=0)
+    first = np.argmin(quiet, axis=0)
+    lag = np.arange(lags)[:, None]
+    # Of all pairs: less those whose earlier sample is loud, or the later one, and again with those of which both are.
+    earlier = np.clip(samples - lag - first, 0, loud)
+    later = np.clip(first + loud - lag, 0, loud)
+    both = np.maximum(loud - lag, 0)
+    return np.asarray((samples - lag - earlier - later + both).sum(axis=1), dtype=np.float64)
 
 
 def _aligned_spectrum(channels: Channels, delay_us: FloatArray, gain: FloatArray) -> tuple[FloatArray, Complex128Array]:
@@ -202,6 +213,24 @@ def _aligned_spectrum(channels: Channels, delay_us: FloatArray, gain: FloatArray
     phase = (2 * np.pi * (delay_us[used] - channels.start_us))[:, None] * frequency[None, :]
     shifted = channels.spectrum[used, low:high] * phasor(phase.astype(np.float32))
     return frequency, np.asarray(gain[used] @ shifted / float((gain**2).sum()), dtype=np.complex128)
+
+
+def _band_of_pulse(frequency: FloatArray, spectrum: Complex128Array, padded: int) -> Band:
+    """The band of the pulse that is at time 0 of :func:`_aligned_spectrum`."""
+    step = frequency[1] - frequency[0]
+    carrier = round(WIDE_BAND.centre_mhz / step)
+    size = int(scipy_fft.next_fast_len(max(frequency.size, math.ceil(MIN_RATE_MHZ / step))))
+    rate = size * step
+    bins = np.zeros(size, dtype=np.complex128)
+    gains = np.exp(-0.5 * ((frequency - WIDE_BAND.centre_mhz) / WIDE_BAND.sigma_mhz) ** 2) * (2.0 * size / padded)
+    bins[(round(frequency[0] / step) - carrier + np.arange(frequency.size)) % size] = spectrum * gains
+    pulse = np.asarray(scipy_fft.ifft(bins))
+    half, away = round(1.2 * rate), round(3.8 * rate)
+    window = np.arange(-half, half + 1)
+    beside = [pulse[(window + middle) % size] for middle in (-away, away)]
+    longer = 4 * window.size
+    floor = float(np.mean([np.abs(np.fft.fft(part, longer)) ** 2 for part in beside]))
+    return pulse_band(pulse[window % size], np.full(longer, floor), carrier * step, rate)
 
 
 def _envelope_maximum(
@@ -227,7 +256,7 @@ def _envelope_maximum(
     gains = np.exp(
         -0.5 * ((frequency - band.centre_mhz)[None, :] / (np.array(SMOOTHINGS)[:, None] * band.sigma_mhz)) ** 2
     )
-    bins = np.zeros((2, len(SMOOTHINGS), size), dtype=np.complex128)
+    bins = np.zeros((2, len(SMOOTHINGS), size), dtype=np.complex64)
     place = (first - carrier + np.arange(frequency.size)) % size
     bins[0][:, place] = spectrum * gains * (2.0 * size / padded)
     bins[1][:, place] = bins[0][:, place] * (2j * np.pi * offset)
@@ -310,19 +339,10 @@ def fit_wavefront(
         EstimationError: the fit leaves the frame, or does not converge.
     """
     state = np.array([x_mm, range_mm, ratio])
-    wide = baseband(channels, WIDE_BAND)
-    delay_us = path_mm(state[0], state[1], state[2], element_x_mm) / speed_mm_us
-    half = round(1.2 * wide.rate_mhz)
-    gain = np.where(channels.live, (range_mm / path_mm(state[0], state[1], state[2], element_x_mm)) ** 2, 0.0)
-    away = round(2.6 * wide.rate_mhz) - half
-    long_pulse = _mean_pulse(aligned(wide, delay_us, half + 2 * half + away), gain)
-    size = 4 * (2 * half + 1)
-    beside = [long_pulse[: 2 * half + 1], long_pulse[-2 * half - 1 :]]
-    floor = np.mean([np.abs(np.fft.fft(part, size)) ** 2 for part in beside], axis=0).mean()
-    middle = long_pulse.size // 2
-    band = pulse_band(
-        long_pulse[middle - half : middle + half + 1], np.full(size, floor), wide.carrier_mhz, wide.rate_mhz
-    )
+    path = path_mm(state[0], state[1], state[2], element_x_mm)
+    delay_us = path / speed_mm_us
+    gain = np.where(channels.live, (range_mm / path) ** 2, 0.0)
+    band = _band_of_pulse(*_aligned_spectrum(channels, delay_us, gain), channels.padded)
 
     signal = baseband(channels, Band(band.centre_mhz, 1.6 * band.sigma_mhz))
     spread_us = 1.2 / (2 * np.pi * band.sigma_mhz)
@@ -352,8 +372,8 @@ def fit_wavefront(
         slope = np.gradient(pulse) * signal.rate_mhz + 2j * np.pi * signal.carrier_mhz * pulse
         energy = float((np.abs(slope) ** 2).sum())
         lateness = np.zeros(gain.size)
-        rest = window[used] - gain[used, None] * pulse[None, :]
-        lateness[used] = -(rest @ slope.conj()).real / (gain[used] * energy)
+        beyond = (window @ slope.conj()).real[used] - gain[used] * float(np.vdot(slope, pulse).real)
+        lateness[used] = -beyond / (gain[used] * energy)
         weight = gain**2 * energy**2 / max(noise.of(slope), 1e-300)
         off_us, off_sigma_us, height = _envelope_maximum(
             *_aligned_spectrum(channels, delay_us, gain), band, channels.padded, channels.sampling_mhz

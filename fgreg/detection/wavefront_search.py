@@ -445,18 +445,24 @@ def search_nearby(
     grid = np.meshgrid(ratios, peak.range_mm + np.array(range_offsets_mm), peak.x_mm + x_offsets, indexing="ij")
     ratio, range_mm, x_mm = (axis.ravel() for axis in grid)
     range_mm = np.maximum(range_mm, 0.5 * MIN_RANGE_MM)
-    index = np.flatnonzero(live)
-    aside = (x_mm[:, None] - element_x_mm[None, index]) / ratio[:, None]
-    path = np.sqrt(range_mm[:, None] ** 2 + aside**2)
-    weight = np.where(np.abs(aside) < MAX_TANGENT * range_mm[:, None], (range_mm[:, None] / path) ** 2, 0.0)
-    elapsed = path / speed_mm_us - peak.signal.start_us
-    outside = peak.signal.data.shape[0] - 1
-    row = np.rint(elapsed * peak.signal.rate_mhz).astype(np.intp)
-    inside = (row >= 0) & (row < outside)
-    weight = np.where(inside, weight, 0.0)
-    turn = phasor((2.0 * np.pi * peak.signal.carrier_mhz * elapsed).astype(np.float32))
-    total = (weight * peak.signal.data[np.where(inside, row, outside), index[None, :]] * turn).sum(axis=1)
-    variance = peak.signal.variance * np.maximum((weight**2).sum(axis=1), 0.25 * min(MIN_SUPPORT, float(index.size)))
+    signal, index = peak.signal, np.flatnonzero(live)
+    outside = signal.data.shape[0] - 1
+    # In single precision: a phase is then right to 1e-4.
+    aside = ((x_mm[:, None] - element_x_mm[None, index]) / ratio[:, None]).astype(np.float32)
+    square = np.square(range_mm).astype(np.float32)[:, None]
+    path2 = np.square(aside)
+    near = path2 < MAX_TANGENT**2 * square
+    path2 += square
+    elapsed = np.sqrt(path2) * np.float32(1.0 / speed_mm_us) - np.float32(signal.start_us)
+    row = np.rint(elapsed * np.float32(signal.rate_mhz)).astype(np.intp)
+    near &= (row >= 0) & (row < outside)
+    weight = square / path2 * near
+    turn = phasor(elapsed * np.float32(2.0 * np.pi * signal.carrier_mhz))
+    turn *= weight
+    turn *= np.take(signal.data, row * signal.data.shape[1] + index, mode="clip")
+    total = turn.sum(axis=1)
+    support = np.vecdot(weight, weight).astype(np.float64)
+    variance = signal.variance * np.maximum(support, 0.25 * min(MIN_SUPPORT, float(index.size)))
     value = np.abs(total) ** 2 / variance - 0.5 * ((ratio - 1.0) / RATIO_SIGMA) ** 2
     best = int(np.argmax(value))
     if value[best] <= peak.statistic:
