@@ -396,7 +396,7 @@ def test_an_aim_is_taken_from_a_picture_exposed_after_the_word(stand: Stand, mon
 
 def test_a_frame_in_hand_when_the_camera_has_moved_gives_no_pose(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     tracker, now = stand.loop.marker_tracker, host_now()
-    found = MarkerFit(SimpleNamespace(camera_T_body=stand.marker), ())  # type: ignore[arg-type]
+    found = MarkerFit(SimpleNamespace(camera_T_body=stand.marker, clearance=None), ())  # type: ignore[arg-type]
 
     def process(t_s: float) -> None:
         tracker._flying = StereoFrame(Stamp(t_s, t_s), np.zeros((2, 2), np.uint8), None, 0), t_s

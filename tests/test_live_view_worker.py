@@ -11,11 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from fgreg.detection.marker import detect_marker
+from fgreg.detection.marker import marker_from_views
 from fgreg.detection.results import MarkerFit
 from fgreg.drivers.base import StereoFrame
 from fgreg.live import view_worker
 from fgreg.live.marker_tracker import MarkerTracker
+from fgreg.live.view_worker import view_roi
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Stamp, TimedPose
 from fgreg.session.setup_reader import read_setup
@@ -65,19 +66,29 @@ class Seeing:
                 return None if self.tracker.missing else self.tracker.poses.newest()
 
 
+def test_a_picture_from_before_a_move_is_no_place_at_rest_of_static_tags(
+    room: tuple[SessionModel, list[Pictures]], tracker: MarkerTracker
+) -> None:
+    tracker.begin_again(math.inf)
+    assert Seeing(tracker).see(*room[1][0]) is None
+    assert tracker.processed == 1
+    assert tracker.whole is None
+
+
 def test_frames_give_the_pose_of_both_views_or_the_reason_without_a_wait(
     room: tuple[SessionModel, list[Pictures]], tracker: MarkerTracker
 ) -> None:
     model, pictures = room
-    seeing = Seeing(tracker)
-    tracker.begin_again(math.inf)
-    assert seeing.see(*pictures[0]) is None
-    assert tracker.whole is None, "a picture from before a move is no place at rest of static tags either"
-    tracker.begin_again(-math.inf)
+    assert model.camera is not None
+    assert model.marker is not None
+    seeing, here = Seeing(tracker), [view_roi(model.camera, model.marker, side) for side in range(2)]
+    compared: MarkerFit | None = None
     for left, right in pictures:
         pose = seeing.see(left, right)
-        expected = detect_marker(left, right, model.camera, model.marker)  # type: ignore[arg-type]
+        views = [roi.detect(image, whole=compared is None) for roi, image in zip(here, (left, right), strict=True)]
+        expected = marker_from_views(views[0], views[1], model.marker, compared)
         assert isinstance(expected, MarkerFit)
+        compared = expected if expected.pose.clearance is not None else compared
         assert pose is not None
         np.testing.assert_allclose(pose.parent_T_child, expected.camera_T_marker, atol=1e-12)
     blank = np.full_like(pictures[0][0], 90)

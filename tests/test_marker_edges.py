@@ -8,7 +8,8 @@ from scipy.special import ndtr
 
 from fgreg.detection.corners import square_corners
 from fgreg.detection.edge_pixels import EdgePixels
-from fgreg.detection.edges import _step_model, fit_edges
+from fgreg.detection.edges import fit_edges
+from fgreg.detection.step_model import normal_cdf, step_model
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.camera_model import CameraModel
 
@@ -40,11 +41,11 @@ def test_step_model_jacobian_against_differences() -> None:
     zeros = np.zeros((2, 50))
     band = EdgePixels(rng.uniform(-4, 4, (2, 50)), rng.uniform(-1, 1, (2, 50)), zeros, *np.ones((2, 2, 50), dtype=bool))
     x = np.array([[0.3, -0.2, 0.1, 20, 3, 150, -5, 0.003, -0.03], [-0.3, 0.2, -0.3, 10, 1, 100, 5, -0.004, 0.02]])
-    _, jacobian = _step_model(band, x)
+    _, jacobian = step_model(band, x)
     for k in range(9):
         d = np.zeros(9)
         d[k] = 1e-5
-        numeric = (_step_model(band, x + d)[0] - _step_model(band, x - d)[0]) / 2e-5
+        numeric = (step_model(band, x + d)[0] - step_model(band, x - d)[0]) / 2e-5
         assert np.abs(numeric - jacobian[:, k]).max() < 1e-7 * max(1.0, np.abs(numeric).max())
 
 
@@ -56,8 +57,27 @@ def test_step_model_is_the_blur_of_a_step_under_sloping_light() -> None:
     d = np.array([-2.0, -0.5, 0.0, 0.7, 3.0])
     expected = [np.sum(scene * np.exp(-0.5 * ((v - e) / s) ** 2)) * (v[1] - v[0]) / (s * np.sqrt(2 * np.pi)) for e in d]
     band = EdgePixels(d[None], np.zeros((1, 5)), np.zeros((1, 5)), *np.ones((2, 1, 5), dtype=bool))
-    model, _ = _step_model(band, np.array([[0.0, 0.0, np.log(s), b, 0.0, w, 0.0, g, 0.0]]))
+    model, _ = step_model(band, np.array([[0.0, 0.0, np.log(s), b, 0.0, w, 0.0, g, 0.0]]))
     assert model[0] == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_normal_distribution_in_single_precision() -> None:
+    t = np.linspace(-12.0, 12.0, 2001).astype(np.float32)
+    density = np.exp(-0.5 * t * t) * np.float32(1.0 / np.sqrt(2.0 * np.pi))
+    assert np.abs(normal_cdf(t, density) - ndtr(t.astype(np.float64))).max() < 3e-7
+
+
+def test_edges_of_the_next_picture_start_where_the_last_one_ended() -> None:
+    start, end, cell = CORNERS, np.roll(CORNERS, -1, axis=0), np.full(4, 25.0)
+    last = fit_edges(PLAIN, as_bytes(square_image(CORNERS, 1.0, noise=1.0)), start, end, cell).again
+    for blur_px, off_px in ((1.0, 0.1), (1.3, 0.1), (1.0, 6.0)):  # the last one is beyond what it can start with
+        image = as_bytes(square_image(CORNERS, blur_px, noise=1.0))
+        off = np.array([off_px, -0.5 * off_px])
+        fresh = fit_edges(PLAIN, image, start + off, end + off, cell)
+        fit = fit_edges(PLAIN, image, start + off, end + off, cell, last)
+        assert fit.good.all()
+        assert np.abs(fit.line - fresh.line).max() < 2e-3
+        assert fit.blur_px == pytest.approx(fresh.blur_px, rel=0.01)
 
 
 @pytest.mark.parametrize("blur_px", [0.7, 1.2, 2.0])

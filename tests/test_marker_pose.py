@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgreg.detection.body_pose import choose_pose
 from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.pose_least_squares import CornerSet, common_covariance, corner_residuals, fit_pose
-from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
+from fgreg.detection.results import MarkerFit, NotFound, RigidFit, marker_covariance
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
 from fgreg.model.camera_model import StereoRig
 from tests.marker_scene import (
@@ -132,6 +134,24 @@ def test_common_error_of_both_views_is_not_averaged_away() -> None:
     assert fit is not None
     sigma_depth = np.sqrt(common_covariance(corners, fit)[5, 5])
     assert sigma_depth == pytest.approx(100.0 * 0.1 / (1000.0 * 15.0 / 100.0), rel=0.02)
+
+
+def test_both_poses_are_compared_again_once_the_body_has_moved() -> None:
+    size = Constant.TAG_SIZE
+    first = choose_pose(corner_set(facing_pose((10.0, -5.0, 120.0), 25.0), 0.02), "marker", [], size)
+    assert isinstance(first, RigidFit)
+    assert first.clearance is not None
+    for tilt_deg, again in ((26.0, False), (30.0, True)):
+        corners = corner_set(facing_pose((10.5, -5.0, 121.0), tilt_deg), 0.02)
+        fit, alone = choose_pose(corners, "marker", [], size, first), choose_pose(corners, "marker", [], size)
+        assert isinstance(fit, RigidFit)
+        assert isinstance(alone, RigidFit)
+        np.testing.assert_allclose(fit.camera_T_body, alone.camera_T_body, atol=1e-6)
+        assert (fit.clearance is not None) == again
+    unclear = replace(first, clearance=2.0)
+    fit = choose_pose(corner_set(first.camera_T_body), "marker", [], size, unclear)
+    assert isinstance(fit, RigidFit)
+    assert fit.clearance is not None
 
 
 def test_one_camera_rig() -> None:

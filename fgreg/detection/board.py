@@ -19,9 +19,9 @@ import numpy.typing as npt
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, robust_pose
 from fgreg.detection.corners import eight_bit, grey, refine_subpixel
 from fgreg.detection.edge_pixels import GreyImage, Image
-from fgreg.detection.edges import MIN_CONTRAST
 from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import BoardFit, NotFound
+from fgreg.detection.step_fit import MIN_CONTRAST
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named, halved
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray

@@ -5,6 +5,8 @@ Where there is no unique pose, the result is a reason.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from fgreg.detection.pose_least_squares import (
@@ -39,6 +41,14 @@ AMBIGUITY_CHI2 = 25.0
 """A pose is ambiguous below this difference in chi-square, at that noise or at the residuals where they are larger.
 Odds of 2.7e5 to 1."""
 
+COMPARED = 1e-5
+"""Fall of the cost, relative to 1 + cost, at which a hypothesis is compared with others."""
+CLEAR = 10.0
+"""Clearance (:class:`RigidFit`) from which a second pose need not be looked for where the body has hardly moved."""
+HARDLY_RAD, HARDLY_SHARE, AS_GOOD = 0.05, 0.1, (1.5, 0.02)
+"""It has hardly moved: its rotation, its position as a share of the distance; and the corners fit as well as before,
+as a factor of their RMS and pixels."""
+
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Angle (rad) between the rotations of two poses (4, 4)."""
@@ -66,14 +76,14 @@ def best_poses(corners: CornerSet) -> list[PoseFit]:
         if any(angle_between(pose, other) < 0.1 for other in tried):
             continue
         tried.append(pose)
-        fit = fit_pose(corners, pose)
+        fit = fit_pose(corners, pose, settled=COMPARED)
         if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
             fits.append(fit)
         if len(tried) >= 4:
             break
     if fits:
         # Under weak perspective the second minimum has the mirrored tilt. A solver may have returned only one of them.
-        fit = fit_pose(corners, _mirrored(corners, fits[0].camera_T_body))
+        fit = fit_pose(corners, _mirrored(corners, fits[0].camera_T_body), settled=COMPARED)
         if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
             fits.append(fit)
     return sorted(fits, key=lambda fit: fit.cost)[:2]
@@ -145,20 +155,42 @@ def _agreement(corners: CornerSet, camera_T_body: FloatArray) -> tuple[FloatArra
     return rms, float(np.minimum(rms, STRAY_START_PX).sum()) if in_front else np.inf
 
 
-def choose_pose(corners: CornerSet, what: str, left_out: list[str], size: Constant) -> RigidFit | NotFound:
+def _found_again(corners: CornerSet, earlier: RigidFit) -> tuple[CornerSet, PoseFit] | None:
+    """The corners with the covariance used, and the pose next to that of an earlier frame, if that was clear and the
+    body has hardly moved."""
+    views = tuple(VIEW_NAMES[v] for v in np.unique(corners.view))
+    if earlier.clearance is None or earlier.clearance < CLEAR or earlier.views != views:
+        return None
+    if earlier.corners != len(corners.view) or (chosen := fit_with_excess(corners, earlier.camera_T_body)) is None:
+        return None
+    pose, before = chosen[1].camera_T_body, earlier.camera_T_body
+    moved = np.linalg.norm(pose[:3, 3] - before[:3, 3])
+    still = angle_between(pose, before) < HARDLY_RAD and moved < HARDLY_SHARE * np.linalg.norm(before[:3, 3])
+    as_good = corners.rms_px(chosen[1].residual_px) < AS_GOOD[0] * earlier.rms_px + AS_GOOD[1]
+    return chosen if still and as_good else None
+
+
+def choose_pose(
+    corners: CornerSet, what: str, left_out: list[str], size: Constant, earlier: RigidFit | None = None
+) -> RigidFit | NotFound:
     """The pose of a body from the better planar hypothesis, if the other one fits significantly worse.
 
     Args:
         what: the body's name in messages, e.g. ``marker``.
         left_out: messages about dropped corners, copied to the result.
         size: the constant that scales the body.
+        earlier: its pose in an earlier frame, in which both were compared: where it hardly moved they are not again.
     """
     numbers = corners.numbers
     if numbers < MIN_NUMBERS:
         return NotFound(f"{what}: only {numbers // 2} corners seen, at least 4 are needed")
-    # Hypotheses are compared at a noise that covers model errors. The chosen one is then fitted at the stated noise.
-    hypotheses = best_poses(corners.with_excess(AMBIGUITY_SIGMA_PX**2))
-    chosen = fit_with_excess(corners, hypotheses[0].camera_T_body) if hypotheses else None
+    chosen = None if earlier is None else _found_again(corners, earlier)
+    ratio, clearance = (np.inf, np.inf) if earlier is None or chosen is None else (earlier.second_ratio, None)
+    hypotheses: list[PoseFit] = []
+    if chosen is None:
+        # Hypotheses are compared at a noise that covers model errors. The chosen one is then fitted at the stated one.
+        hypotheses = best_poses(corners.with_excess(AMBIGUITY_SIGMA_PX**2))
+        chosen = fit_with_excess(corners, hypotheses[0].camera_T_body) if hypotheses else None
     if chosen is None:
         return NotFound(f"{what}: no pose fits the corners seen")
     stated = corners.covariance
@@ -169,11 +201,11 @@ def choose_pose(corners: CornerSet, what: str, left_out: list[str], size: Consta
         cause = "the two views or the model" if len(views) == 2 else "the model"
         return NotFound(f"{what}: corners {rms:.1f} px off the best pose; {cause} cannot be right")
     dof = numbers - 6
-    ratio = np.inf
     if len(hypotheses) == 2:
         first, second = hypotheses
         ratio = corners.rms_px(second.residual_px) / max(corners.rms_px(first.residual_px), 1e-9)
-        if second.cost - first.cost < AMBIGUITY_CHI2 * max(1.0, first.cost / max(dof, 1)):
+        clearance = (second.cost - first.cost) / (AMBIGUITY_CHI2 * max(1.0, first.cost / max(dof, 1)))
+        if clearance < 1.0:
             kind = "ambiguous single view" if len(views) == 1 else "ambiguous"
             apart = np.degrees(angle_between(first.camera_T_body, second.camera_T_body))
             return NotFound(f"{what}: {kind}: a second pose {apart:.0f} deg away fits only {ratio:.1f} times worse")
@@ -187,8 +219,9 @@ def choose_pose(corners: CornerSet, what: str, left_out: list[str], size: Consta
         views=views,
         rms_px=rms,
         second_ratio=float(ratio),
+        clearance=clearance,
         left_out=tuple(left_out),
-        dependence=_dependence(corners, stated, best, size),
+        tell_dependence=partial(_dependence, corners, stated, best, size),
     )
 
 

@@ -11,6 +11,7 @@ side of a corner is hidden, the corner is a point of the other side with a sigma
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.edge_pixels import GreyImage, Image, segment_frames
-from fgreg.detection.edges import MIN_CONTRAST, fit_edges
+from fgreg.detection.edges import EdgeStart, fit_edges
 from fgreg.detection.frame_files import white_level
-from fgreg.geometry.transforms import BoolArray, FloatArray
+from fgreg.detection.step_fit import MIN_CONTRAST
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.camera_model import CameraModel
-from fgreg.model.lens import ideal_from_pixels, pixel_by_ideal_jacobian
+from fgreg.model.lens import ideal_by_pixel_jacobian, ideal_from_pixels, inverse_2x2
 
 CORNER_FLOOR_PX = 0.003
 """Added to the sigma of corners from edges: independent errors that remain after averaging along an edge."""
@@ -44,6 +46,8 @@ LOOSE_PX = 20.0
 """Sigma along the other side of a corner of which only one side was found: that side counts, the corner does not."""
 MIN_EDGE_PX = 12.0
 """Corners of shorter edges come from sub-pixel refinement."""
+NEXT, PREVIOUS = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
+"""The corner after and before each corner of a square, and the sides alike: side k runs from corner k to the next."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +61,7 @@ class SquareCorners:
         from_edges: (n, 4) whether a corner comes from edges (both, or one), else from sub-pixel refinement.
         common_px: (n, 4) sigma of the corner error that is the same in both views.
         outward_px: (n, 4, 2) one sigma of the outward error common to all squares.
+        again: (n,) what the fit of the square in the next picture may start with; None where a side was not found.
     """
 
     ideal_px: FloatArray
@@ -65,6 +70,7 @@ class SquareCorners:
     from_edges: BoolArray
     common_px: FloatArray
     outward_px: FloatArray
+    again: tuple[EdgeStart | None, ...]
 
 
 def grey(image: npt.NDArray[np.generic]) -> GreyImage:
@@ -112,7 +118,13 @@ def refine_subpixel(image: GreyImage, corners_px: FloatArray, half_window_px: in
 
 
 def square_corners(
-    camera: CameraModel, image: GreyImage, corners_px: FloatArray, cells: int, *, edges: bool = True
+    camera: CameraModel,
+    image: GreyImage,
+    corners_px: FloatArray,
+    cells: int,
+    *,
+    edges: bool = True,
+    last: Sequence[EdgeStart | None] = (),
 ) -> SquareCorners:
     """Refine the outer corners of black squares.
 
@@ -121,16 +133,17 @@ def square_corners(
         corners_px: (n, 4, 2) from a detector, clockwise as seen.
         cells: squares along the side, border included: the black border is one cell wide.
         edges: False uses sub-pixel refinement only (for comparison).
+        last: ``again`` of the same squares in the last picture, where all are known.
     """
     n = len(corners_px)
     height, width = image.shape
-    sides = np.linalg.norm(np.roll(corners_px, -1, axis=1) - corners_px, axis=2)
+    sides = _lengths(corners_px[:, NEXT] - corners_px)
     cell_px = sides.min(axis=1) / cells
 
     # Fallback: sub-pixel refinement, not reaching past the border's inner edge.
     fallback = np.empty_like(corners_px)
     for k in range(n):
-        reach = int(np.clip(np.floor(0.6 * cell_px[k]), 2, 5))
+        reach = min(max(int(0.6 * cell_px[k]), 2), 5)
         fallback[k] = refine_subpixel(image, corners_px[k], reach)
     ideal = ideal_from_pixels(camera, fallback)
     # At the image's border sub-pixel refinement lacks pixels, and the corner may be the point where the border cuts
@@ -141,57 +154,76 @@ def square_corners(
     covariance = np.zeros((n, 8, 8))
     covariance[:, np.arange(8), np.arange(8)] = FALLBACK_SIGMA_PX**2
 
-    usable = np.flatnonzero(np.isfinite(ideal).all(axis=(1, 2)) & (sides.min(axis=1) >= MIN_EDGE_PX))
+    usable: IntArray = np.flatnonzero(np.isfinite(ideal).all(axis=(1, 2)) & (sides.min(axis=1) >= MIN_EDGE_PX))
+    again: list[EdgeStart | None] = [None] * n
     if not edges or usable.size == 0:
-        return _with_common(ideal, covariance, found, from_edges, sides, np.ones(n), np.zeros(n))
+        return _with_common(ideal, covariance, found, from_edges, sides, np.ones(n), np.zeros(n), again)
 
     start = ideal[usable].reshape(-1, 2)
-    end = np.roll(ideal[usable], -1, axis=1).reshape(-1, 2)
-    fit = fit_edges(camera, image, start, end, np.repeat(cell_px[usable], 4))
+    end = ideal[usable][:, NEXT].reshape(-1, 2)
+    known = [known for k in usable.tolist() if last and (known := last[k]) is not None]
+    begin = EdgeStart.joined(known) if len(known) == len(usable) else None
+    fit = fit_edges(camera, image, start, end, np.repeat(cell_px[usable], 4), begin)
     middle, direction, normal, half = (a.reshape(-1, 4, *a.shape[1:]) for a in segment_frames(start, end))
     line, good = fit.line.reshape(-1, 4, 2), fit.good.reshape(-1, 4)
     line_covariance = fit.covariance.reshape(-1, 4, 2, 2)
     # A sub-pixel corner is used only on small squares whose outline separates dark from light.
     step = (fit.step > MIN_CONTRAST).reshape(-1, 4)
-    found[usable] &= step & np.roll(step, 1, axis=1) & (sides[usable].min(axis=1) < MAX_FALLBACK_EDGE_PX)[:, None]
+    found[usable] &= step & step[:, PREVIOUS] & (sides[usable].min(axis=1) < MAX_FALLBACK_EDGE_PX)[:, None]
     # A side that was not found is replaced by its starting line with a sigma that says nothing.
     line[~good] = 0.0
     line_covariance[~good] = LOOSE_PX**2 * np.eye(2)
-    for row, k in enumerate(usable.tolist()):
-        jacobian = np.zeros((8, 8))
-        for c in range(4):
-            e, g = (c - 1) % 4, c  # the edges that end and start at this corner
-            sides_found = int(good[row, e]) + int(good[row, g])
-            if sides_found < 2 and (found[k, c] or not good[row].any()):
-                continue
-            # n' (x - middle) = o + m * d' (x - middle) / half, for both edges
-            rows = np.stack([normal[row, i] - line[row, i, 1] / half[row, i] * direction[row, i] for i in (e, g)])
-            right = np.array([rows[j] @ middle[row, i] + line[row, i, 0] for j, i in enumerate((e, g))])
-            inverse = np.linalg.inv(rows)
-            corner = inverse @ right
-            if np.linalg.norm(corner - start.reshape(-1, 4, 2)[row, c]) > max(5.0, 0.8 * cell_px[k]):
-                continue
-            ideal[k, c] = corner
-            from_edges[k, c] = found[k, c] = True
-            for j, i in enumerate((e, g)):
-                place = direction[row, i] @ (corner - middle[row, i]) / half[row, i]
-                jacobian[2 * c : 2 * c + 2, 2 * i] = inverse[:, j]
-                jacobian[2 * c : 2 * c + 2, 2 * i + 1] = inverse[:, j] * place
-        lines = np.zeros((8, 8))
-        for i in range(4):
-            lines[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = line_covariance[row, i]
-        from_lines = jacobian @ lines @ jacobian.T
-        sigma = np.where(np.repeat(from_edges[k], 2), CORNER_FLOOR_PX, FALLBACK_SIGMA_PX)
-        covariance[k] = from_lines + np.diag(sigma**2)
+    corner, jacobian = _crossings(line, middle, direction, normal, half)
+    off = corner - start.reshape(-1, 4, 2)
+    both_found, one_found = good & good[:, PREVIOUS], good.any(axis=1, keepdims=True) & ~found[usable]
+    # Where there is none, or it is far off, the comparison is false.
+    use = (both_found | one_found) & (np.vecdot(off, off) <= np.square(np.maximum(5.0, 0.8 * cell_px[usable]))[:, None])
+    ideal[usable] = np.where(use[..., None], corner, ideal[usable])
+    from_edges[usable] = use
+    found[usable] |= use
+    jacobian = np.where(use[:, :, None, None, None], jacobian, 0.0)
+    weighed = jacobian.reshape(-1, 8, 4, 1, 2) @ line_covariance[:, None]
+    from_lines = weighed.reshape(-1, 8, 8) @ jacobian.reshape(-1, 8, 8).swapaxes(1, 2)
+    sigma = np.where(np.repeat(use, 2, axis=1), CORNER_FLOOR_PX, FALLBACK_SIGMA_PX)
+    covariance[usable] = from_lines + np.square(sigma)[..., None] * np.eye(8)
     # A fallback corner's sigma is in image pixels: bring it to ideal ones.
     for k, c in np.argwhere(found & ~from_edges).tolist():
-        inverse = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal[k, c]))
+        inverse = ideal_by_pixel_jacobian(camera, ideal[k, c])
         covariance[k, 2 * c : 2 * c + 2, 2 * c : 2 * c + 2] = FALLBACK_SIGMA_PX**2 * inverse @ inverse.T
     blur2 = np.ones(n)
     blur2[usable] = np.square(fit.blur_px).reshape(-1, 4).mean(axis=1)
     by_response = np.zeros(n)
     by_response[usable] = (fit.by_response * fit.good).reshape(-1, 4).max(axis=1)
-    return _with_common(ideal, covariance, found, from_edges, sides, blur2, by_response)
+    for k, its, sides_good in zip(usable.tolist(), fit.again.of_squares(), good, strict=True):
+        again[k] = its if sides_good.all() else None
+    return _with_common(ideal, covariance, found, from_edges, sides, blur2, by_response, again)
+
+
+def _lengths(vectors: FloatArray) -> FloatArray:
+    """(...,) of (..., 2)."""
+    return np.asarray(np.sqrt(np.vecdot(vectors, vectors)))
+
+
+def _crossings(
+    line: FloatArray, middle: FloatArray, direction: FloatArray, normal: FloatArray, half: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where each side of squares meets the one before it: (k, 4, 2), and its derivatives by the lines, (k, 4, 2, 4, 2).
+
+    Args:
+        line: (k, 4, 2) of the sides, as of :class:`fgreg.detection.edges.EdgeFit`.
+        middle, direction, normal, half: (k, 4, ...) of the sides, as of :func:`segment_frames`.
+    """
+    # n' (x - middle) = o + m * d' (x - middle) / half, for both sides
+    rows = normal - (line[..., 1] / half)[..., None] * direction
+    right = np.vecdot(rows, middle) + line[..., 0]
+    inverse = inverse_2x2(np.stack([rows[:, PREVIOUS], rows], axis=2))
+    corner = (inverse @ np.stack([right[:, PREVIOUS], right], axis=2)[..., None])[..., 0]
+    jacobian, corners = np.zeros((len(line), 4, 2, 4, 2)), np.arange(4)
+    for k, side in enumerate((PREVIOUS, corners)):
+        place = np.vecdot(direction[:, side], corner - middle[:, side]) / half[:, side]
+        jacobian[:, corners, :, side, 0] = inverse[..., k].swapaxes(0, 1)
+        jacobian[:, corners, :, side, 1] = (inverse[..., k] * place[..., None]).swapaxes(0, 1)
+    return corner, jacobian
 
 
 def _with_common(
@@ -202,6 +234,7 @@ def _with_common(
     sides_px: FloatArray,
     blur2: FloatArray,
     by_response: FloatArray,
+    again: list[EdgeStart | None],
 ) -> SquareCorners:
     """Add the common errors. They are larger for short edges, which average over fewer pixels.
 
@@ -210,7 +243,7 @@ def _with_common(
     from_edge = COMMON_PX * np.sqrt(COMMON_LENGTH_PX / np.maximum(sides_px.min(axis=1), 1.0))
     common = np.where(from_edges, (from_edge * np.sqrt(blur2))[:, None], COMMON_FALLBACK_PX)
     arm = ideal - ideal.mean(axis=1, keepdims=True)
-    arm /= np.maximum(np.linalg.norm(arm, axis=2, keepdims=True), 1e-9)
+    arm /= np.maximum(_lengths(arm), 1e-9)[..., None]
     outward_px = np.hypot(OUTWARD_PX * blur2, np.sqrt(2.0) * by_response)
     outward = arm * np.where(from_edges, outward_px[:, None], OUTWARD_FALLBACK_PX)[..., None]
-    return SquareCorners(ideal, covariance, found, from_edges, common, outward)
+    return SquareCorners(ideal, covariance, found, from_edges, common, outward, tuple(again))

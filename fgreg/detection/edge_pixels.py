@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.camera_model import CameraModel
-from fgreg.model.lens import distort_jacobian, focal_px, pixels_from_ideal
+from fgreg.model.lens import ideal_by_pixel_jacobian, pixels_from_ideal
 
 Image = npt.NDArray[np.uint8]
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.float32]
 """Grey levels from 0 to 255, with fractions where the picture has more than 8 bits."""
 
-CURVE_NODES = 17
+PixelArray = npt.NDArray[np.floating[Any]]
+"""Of single precision, but for tests of the model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,11 +25,18 @@ class EdgePixels:
     """p pixels for each of n edges, all (n, p): distance d, position u, grey level, whether it is used, and whether its
     line is odd."""
 
-    d: FloatArray
-    u: FloatArray
-    grey: FloatArray
+    d: PixelArray
+    u: PixelArray
+    grey: PixelArray
     used: BoolArray
     odd: BoolArray
+
+    def some(self, one_in: int) -> EdgePixels:
+        """Every so many-th pixel."""
+        pixels = slice(None, None, one_in)
+        return EdgePixels(
+            self.d[:, pixels], self.u[:, pixels], self.grey[:, pixels], self.used[:, pixels], self.odd[:, pixels]
+        )
 
 
 def segment_frames(start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -37,7 +46,7 @@ def segment_frames(start: FloatArray, end: FloatArray) -> tuple[FloatArray, Floa
     clockwise as seen.
     """
     half = 0.5 * (end - start)
-    length = np.linalg.norm(half, axis=-1)
+    length = np.sqrt(np.vecdot(half, half))
     direction = half / length[..., None]
     normal = np.stack([direction[..., 1], -direction[..., 0]], axis=-1)
     return 0.5 * (start + end), direction, normal, length
@@ -52,62 +61,65 @@ def edge_pixels(
     trim: FloatArray,
     rows: int,
 ) -> EdgePixels:
-    """Gather pixels: one row per pixel step along the edge's major axis, and across it the pixels within half_width."""
+    """Gather pixels: lines of the image that cross an edge, at most so many rows, and in each those within half_width.
+
+    The lines are multiples of a step in the whole image, in quarters: a start a little off gives the same pixels.
+    """
     middle, direction, normal, half_length = segment_frames(start, end)
-    n = len(start)
-    # The ideal segment, trimmed at its ends, in distorted pixels.
-    s_nodes = np.linspace(-1.0, 1.0, CURVE_NODES) * (half_length - trim)[:, None]
-    nodes = pixels_from_ideal(camera, middle[:, None] + s_nodes[..., None] * direction[:, None])
-    chord = np.abs(nodes[:, -1] - nodes[:, 0])
+    edge, inner = np.arange(len(start)), (half_length - trim)[:, None]
+    # The ideal segment, trimmed at its ends, in pixels: its ends and its middle.
+    nodes = pixels_from_ideal(
+        camera, middle[:, None] + (np.array([-1.0, 0.0, 1.0]) * inner)[..., None] * direction[:, None]
+    )
+    chord = np.abs(nodes[:, 2] - nodes[:, 0])
     major = (chord[:, 1] > chord[:, 0]).astype(np.intp)
-    along_nodes = np.take_along_axis(nodes, major[:, None, None], axis=2)[..., 0]
-    count = min(rows, int(chord.max()) + 1)
-    steps = np.linspace(0.0, 1.0, count)
-    along = np.rint(along_nodes[:, :1] + steps * (along_nodes[:, -1:] - along_nodes[:, :1]))
-    fresh = np.ones(along.shape, dtype=bool)
-    fresh[:, 1:] = along[:, 1:] != along[:, :-1]
-    s = np.empty(along.shape)
-    for k in range(n):
-        forward = along_nodes[k, -1] > along_nodes[k, 0]
-        order = slice(None) if forward else slice(None, None, -1)
-        s[k] = np.interp(along[k], along_nodes[k, order], s_nodes[k, order])
+    minor = 1 - major
+    begin, half_way, finish = nodes[edge, :, major].T[..., None]
+    low, high = np.minimum(begin, finish), np.maximum(begin, finish)
+    quarters = np.maximum(np.ceil(4.0 * (high - low) / rows), 4.0)
+    step = 0.25 * np.where(quarters % 8.0 == 0.0, quarters + 1.0, quarters)  # odd and even lines
+    first = np.ceil(low / step)
+    line = np.floor((first + np.arange(max(1, int(((high - low) / step).max()) + 1))) * step)
+    crossing = line <= high
+    line = np.minimum(line, np.floor(high))
+    # Where a line crosses, by the parabola through the three: to a fraction of a pixel, and the rest to first order.
+    s = (
+        inner
+        * (line - half_way)
+        * (
+            (line - begin) / ((finish - begin) * (finish - half_way))
+            - (line - finish) / ((begin - finish) * (begin - half_way))
+        )
+    )
     ideal = middle[:, None] + s[..., None] * direction[:, None]
     centre = pixels_from_ideal(camera, ideal)
-    # Across: pixels along the minor axis; a slanted edge needs up to sqrt(2) more of them.
-    reach = int(np.ceil(half_width.max() * np.sqrt(2.0))) + 1
-    offsets = np.arange(-reach, reach + 1)
     nearest = np.rint(centre)
-    # Ideal distance of a pixel to first order about its row's centre: the band is narrow.
-    f = focal_px(camera)
-    inverse_jacobian = np.linalg.inv(f[:, None] * distort_jacobian(camera, ideal / f) / f)
-    height, width = image.shape
-    parts = []
-    for k in range(n):  # one edge at a time: its arrays stay in the cache
-        minor, other = 1 - major[k], major[k]
-        across = nearest[k, :, minor, None] + offsets
-        off = across - centre[k, :, minor, None]
-        beside = (nearest[k, :, other] - centre[k, :, other])[:, None]
-        by_normal = normal[k] @ inverse_jacobian[k]
-        d = by_normal[:, minor, None] * off + by_normal[:, other, None] * beside
-        limits = (width, height)
-        inside = (across >= 0) & (across < limits[minor])
-        inside &= ((nearest[k, :, other] >= 0) & (nearest[k, :, other] < limits[other]) & fresh[k])[:, None]
-        row, column = np.nonzero(inside & (np.abs(d) <= half_width[k]))
-        by_direction = direction[k] @ inverse_jacobian[k]
-        u = by_direction[row, minor] * off[row, column] + by_direction[row, other] * beside[row, 0]
-        at = across[row, column].astype(np.intp), nearest[k, row, other].astype(np.intp)
-        iy, ix = at if minor == 1 else at[::-1]
-        parts.append((d[row, column], (s[k, row] + u) / half_length[k], image[iy, ix], iy % 2 == 1))
-    return _joined(parts)
-
-
-def _joined(parts: list[tuple[FloatArray, FloatArray, GreyImage, BoolArray]]) -> EdgePixels:
-    """The pixels (d, u, grey, odd) of each edge as rows of one array, padded to the longest row."""
-    shape = len(parts), max(1, *(len(part[0]) for part in parts)) if parts else 1
-    no = np.zeros(shape, dtype=bool)
-    band = EdgePixels(np.zeros(shape), np.zeros(shape), np.zeros(shape), no, no.copy())
-    for k, (d, u, grey, odd) in enumerate(parts):
-        count = len(d)
-        band.d[k, :count], band.u[k, :count], band.grey[k, :count], band.used[k, :count] = d, u, grey, True
-        band.odd[k, :count] = odd
-    return band
+    nearest[edge, :, major] = line
+    beside = nearest - centre
+    pixel = nearest.astype(np.intp)
+    # Across: pixels along the minor axis, as many as the most slanted edge needs.
+    slant = chord[edge, minor] / np.maximum(chord[edge, major], 1e-9)
+    reach = int(1.05 * float((half_width * np.hypot(1.0, slant)).max()) + 0.5)
+    offsets = np.arange(-reach, reach + 1)
+    # Ideal place of a pixel to first order about its row's point: the band is narrow.
+    axes = np.stack([normal, direction / half_length[:, None]], axis=1)  # of d and u
+    by_pixel = axes[:, None] @ ideal_by_pixel_jacobian(camera, ideal)
+    rest = by_pixel[edge, :, :, major] * beside[edge, :, major, None]
+    rest[..., 1] += s / half_length[:, None]
+    off = (beside[edge, :, minor, None] + offsets).astype(np.float32)
+    d, u = (
+        off * by_pixel[edge, :, axis, minor, None].astype(np.float32) + rest[..., axis, None].astype(np.float32)
+        for axis in range(2)
+    )
+    limits, steps = np.array(image.shape[::-1]), np.array([1, image.shape[1]])
+    lines, across = pixel[edge, :, major], pixel[edge, :, minor]
+    used = np.abs(d) <= half_width.astype(np.float32)[:, None, None]
+    used &= (crossing & (lines >= 0) & (lines < limits[major, None]))[..., None]
+    if across.min() < reach or (across.max(axis=1) >= limits[minor] - reach).any():
+        at = across[..., None] + offsets
+        used &= (at >= 0) & (at < limits[minor, None, None])
+    at = (across * steps[minor, None] + lines * steps[major, None])[..., None] + offsets * steps[minor, None, None]
+    grey = np.take(image, at, mode="clip").astype(np.float32)
+    odd = (pixel[..., 1:] + offsets * minor[:, None, None]) & 1 == 1
+    n = len(start)
+    return EdgePixels(d.reshape(n, -1), u.reshape(n, -1), grey.reshape(n, -1), used.reshape(n, -1), odd.reshape(n, -1))

@@ -23,37 +23,36 @@ Lengths are *ideal* pixels (camera.py), without lens distortion: the edges of a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
-from fgreg.detection.edge_pixels import EdgePixels, GreyImage, edge_pixels, segment_frames
+from fgreg.detection.edge_pixels import EdgePixels, GreyImage, PixelArray, edge_pixels, segment_frames
+from fgreg.detection.step_fit import (
+    AGAIN,
+    FIRST,
+    MAX_BLUR_PX,
+    MIN_CONTRAST,
+    SECOND,
+    WITH_RESPONSE,
+    Optimum,
+    column,
+    fit_steps,
+    median,
+    normal_equations,
+    sum_of_squares,
+)
+from fgreg.detection.step_model import PARAMETERS, WHITE
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.camera_model import CameraModel
 
-MAX_ROWS = 112
-"""Largest number of pixel rows used across an edge; longer edges are sampled evenly."""
+FIRST_ROWS, MAX_ROWS = 44, 120
+"""Most pixel rows used across an edge in the first pass and in the second; longer edges are sampled evenly."""
 SECTIONS, MIN_SECTIONS = 8, 6
 """Parts of an edge, and the number of parts in which both sides must be in the image."""
-MIN_CONTRAST = 12.0
-"""Least difference in grey levels between the dark and the light side of an edge."""
-MAX_BLUR_PX = 5.0
-LEVEL_SLOPE_SIGMA = 0.3
-"""Prior sigma of b1 and w1 as a share of the contrast: short edges do not determine them."""
-LOG_BLUR_SIGMA = 0.7
-"""Prior sigma of log s about the starting blur: a step as sharp as a pixel does not determine it."""
-FALL_OFF_SIGMA = 0.004
-"""Prior sigma of g, per px: light changes by about half over a hundred pixels."""
-FALL_OFF_COMMON_SIGMA = 0.0001
-"""The same about the value from the first pass, which opposite edges of a square share."""
-KURTOSIS_SIGMA, MAX_KURTOSIS = 0.03, 0.08
-"""Prior sigma and largest size of c."""
-PARAMETERS = 9
-STEEP = 0.3
-"""Pixels at which the model is at least this steep, as a share of its steepest, tell its misfit."""
-WHITE, CUT_OFF = 255.0, 254.5
-"""The highest grey level, and that from which a pixel may be brighter than it says."""
+CUT_OFF = 254.5
+"""Grey level from which a pixel may be brighter than it says."""
 VIDEO, VIDEO_SIGMA = 0.5, 0.08
 """Exponent of video's response (ITU-R BT.709, sRGB) as a power of the light, and how far cameras differ from it."""
 EDGE_ERROR, COMMON_ERROR, FULL_RATIO = 0.1, (0.05, 7.0), 16.0
@@ -71,14 +70,35 @@ dark there is a veil (smoke, glare) that may vary across the edge."""
 LEAST_EXPONENT, MOST_EXPONENT = 0.2, 1.3
 CLEARLY_LINEAR = 1e-4
 """Odds of video's response below which it is not looked at."""
-MEDIAN_SIGMAS = 0.6745
-"""Median of the size of a normally distributed residual, in standard deviations."""
-BINS, CLEAN_SHARE = 40, 0.75
-"""Parts along an edge, and the mean weight of a part's pixels below which all of them are left out."""
-RESPONSE_STEPS = 3
-"""Iterations of the fit with video's response: a sigma needs no more, and later ones change o by 0.003 px."""
-REWEIGH_AT = 4
-"""First iteration that down-weights outlier pixels."""
+SAME_PLACE_PX = 1.0
+"""An edge that is this far from where the last picture had it, beside its starting segment, is looked for as a new one.
+"""
+RESPONSE_PIXELS = 4
+"""One pixel in this many is used for it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeStart:
+    """What a fit found that the fit of the same edges in the next picture may start with.
+
+    Attributes:
+        parameters: (n, 9) of the step, light and blur included, about the starting segment.
+        response: (n,) one sigma of o by the camera's response, in blurs.
+    """
+
+    parameters: FloatArray
+    response: FloatArray
+
+    def of_squares(self) -> list[EdgeStart]:
+        """Of each square, four edges."""
+        return [
+            EdgeStart(self.parameters[k : k + 4], self.response[k : k + 4]) for k in range(0, len(self.response), 4)
+        ]
+
+    @staticmethod
+    def joined(parts: Sequence[EdgeStart]) -> EdgeStart:
+        """Of all edges of some squares."""
+        return EdgeStart(np.concatenate([p.parameters for p in parts]), np.concatenate([p.response for p in parts]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +112,7 @@ class EdgeFit:
         step: (n,) grey levels, left side of the starting segment less its right side.
         good: (n,) whether the edge passed all checks.
         by_response: (n,) one sigma of o, px, by the camera's response: one error for all edges.
+        again: where to start in the next picture.
     """
 
     line: FloatArray
@@ -100,208 +121,64 @@ class EdgeFit:
     step: FloatArray
     good: BoolArray
     by_response: FloatArray
-
-
-def _step_model(band: EdgePixels, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Grey levels (n, p) of parameters (n, 9) = (o, m, log s, b0, b1, w0, w1, g, c), and their Jacobian (n, 9, p)."""
-    u = band.u
-    blur = np.exp(x[:, 2])[:, None]
-    fall, kurtosis = x[:, 7:8], x[:, 8:9]
-    e = band.d - x[:, :1] - x[:, 1:2] * u
-    t = e / blur
-    t2 = t * t
-    phi = np.exp(-0.5 * t2)
-    phi *= 1.0 / np.sqrt(2.0 * np.pi)
-    t_phi = t * phi
-    he3_phi = (t2 - 3.0) * t_phi
-    profile = ndtr(t) - kurtosis * he3_phi
-    slope = (t2 * (t2 - 6.0) + 3.0) * kurtosis  # of the profile
-    slope += 1.0
-    slope *= phi
-    light = fall * e
-    light += 1.0
-    blur_phi = blur * phi
-    dark = x[:, 4:5] * u + x[:, 3:4]
-    step = (x[:, 6:7] - x[:, 4:5]) * u + (x[:, 5:6] - x[:, 3:4])
-    jacobian = np.empty((len(u), PARAMETERS, u.shape[1]))
-    by_offset, by_slope, by_blur, low, low_u, high, high_u, by_fall, by_kurtosis = jacobian.swapaxes(0, 1)
-    # Shares of the two levels: they add up to the light that falls on the pixel.
-    np.multiply(light, profile, out=high)
-    high += fall * blur_phi
-    np.subtract(light, high, out=low)
-    np.multiply(low, u, out=low_u)
-    np.multiply(high, u, out=high_u)
-    # d high / d e = fall (P - t phi) + light P' / s;  d high / d log s = -P' t light + fall s phi (1 + t^2)
-    slope *= light
-    np.subtract(t_phi, profile, out=by_offset)
-    by_offset *= fall
-    by_offset -= slope / blur
-    by_offset *= step
-    by_offset -= fall * dark
-    np.multiply(by_offset, u, out=by_slope)
-    t2 += 1.0
-    t2 *= blur_phi
-    t2 *= fall
-    np.multiply(slope, t, out=by_blur)
-    np.subtract(t2, by_blur, out=by_blur)
-    by_blur *= step
-    np.multiply(e, profile, out=by_fall)
-    by_fall += blur_phi
-    by_fall *= step
-    by_fall += e * dark
-    np.multiply(light, he3_phi, out=by_kurtosis)
-    by_kurtosis *= -step
-    return dark * light + step * high, jacobian
-
-
-def _seen(light: FloatArray, by_light: FloatArray, exponent: float) -> tuple[FloatArray, FloatArray]:
-    """Grey levels (n, p) of light (n, p), 255 (light / 255)^exponent; and their Jacobian (n, k, p), by the light's,
-    which is overwritten."""
-    if exponent == 1.0:
-        return light, by_light
-    share = np.maximum(light, 0.5) / WHITE
-    grey = WHITE * share**exponent
-    by_light *= (exponent / WHITE * grey / share)[:, None]
-    return grey, by_light
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Optimum:
-    """Parameters (n, 9) at the optimum, with grey levels, residuals, weights (n, p) and Jacobian (n, 9, p) there, and
-    the inverse variances (n, 9) of the priors."""
-
-    x: FloatArray
-    grey: FloatArray
-    residual: FloatArray
-    weight: FloatArray
-    jacobian: FloatArray
-    prior: FloatArray
+    again: EdgeStart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BandFit:
-    """Parameters (n, 9), inverse normal matrix (n, 9, 9), pixel noise sigma (n,); by the response's exponent: what one
-    Gauss-Newton step would change of it (n,), and its information (n,); and how far apart odd and even lines have the
-    edge (n,) px, 0 where that may be noise."""
+    """Parameters (n, 9), inverse normal matrix (n, 9, 9), pixel noise sigma (n,); and how far apart odd and even lines
+    have the edge (n,) px, 0 where that may be noise."""
 
     x: FloatArray
     inverse_normal: FloatArray
     sigma: FloatArray
-    exponent_step: FloatArray
-    exponent_information: FloatArray
     between_fields: FloatArray
 
 
-def _fit_band(
-    band: EdgePixels,
-    start: FloatArray,
-    iterations: int,
-    tolerance_px: float,
-    fall_off_sigma: float,
-    near: bool,
-    exponent: float = 1.0,
-) -> _Optimum:
-    """The edges by Levenberg-Marquardt, for a camera with this response."""
-    x = start.copy()
-    contrast = np.maximum(np.abs(x[:, 5] - x[:, 3]), MIN_CONTRAST)
-    # Priors: inverse variances about the start.
-    prior = np.zeros_like(x)
-    prior[:, 2] = LOG_BLUR_SIGMA**-2
-    prior[:, 4] = prior[:, 6] = (LEVEL_SLOPE_SIGMA * contrast) ** -2.0
-    prior[:, 7] = fall_off_sigma**-2
-    prior[:, 8] = KURTOSIS_SIGMA**-2
-    centre = np.zeros_like(x)
-    centre[:, [2, 7]] = x[:, [2, 7]]
-    diagonal = np.arange(PARAMETERS)
-
-    bins = np.clip((0.5 * BINS * (band.u + 1.0)).astype(np.intp), 0, BINS - 1) + BINS * np.arange(len(x))[:, None]
-    bins[~band.used] = BINS * len(x)
-    weight = band.used.astype(np.float64)
-    sigma = 0.1 * contrast
-    damping = np.full(len(x), 1e-3)
-    grey, jacobian = _seen(*_step_model(band, x), exponent)
-    residual = band.grey - grey
-    cost = np.full(len(x), np.inf)
-    for iteration in range(iterations):
-        if iteration == 0 or near or iteration >= REWEIGH_AT:
-            if iteration > 0 or near:
-                # Down-weight outlier pixels (a speck, a glint).
-                sigma = _typical(residual, band.used, jacobian[:, 0])
-                weight = band.used / (1.0 + np.square(np.square(residual / (4.0 * sigma[:, None]))))
-                if near:
-                    weight *= _clean_bins(weight, bins)
-            cost = np.sum(weight * residual**2, axis=1) / sigma**2 + np.sum(prior * (x - centre) ** 2, axis=1)
-        jw = jacobian * (weight / sigma[:, None] ** 2)[:, None]
-        normal = jw @ np.swapaxes(jacobian, 1, 2)
-        normal[:, diagonal, diagonal] += prior
-        gradient = (jw @ residual[..., None])[..., 0] - prior * (x - centre)
-        damped = normal.copy()
-        damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-        damped[:, diagonal, diagonal] += 1e-9
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
-        step[:, 2] = np.clip(step[:, 2], -0.5, 0.5)
-        y = x + step
-        y[:, 2] = np.clip(y[:, 2], np.log(0.2), np.log(2.0 * MAX_BLUR_PX))
-        y[:, 8] = np.clip(y[:, 8], -MAX_KURTOSIS, MAX_KURTOSIS)
-        new_grey, new_jacobian = _seen(*_step_model(band, y), exponent)
-        new_residual = band.grey - new_grey
-        new_cost = np.sum(weight * new_residual**2, axis=1) / sigma**2 + np.sum(prior * (y - centre) ** 2, axis=1)
-        better = new_cost <= cost
-        damping = np.where(better, damping * 0.1, damping * 10.0)
-        if better.all():
-            x, cost, residual, jacobian, grey = y, new_cost, new_residual, new_jacobian, new_grey
-        else:
-            x[better], cost[better] = y[better], new_cost[better]
-            residual[better], jacobian[better] = new_residual[better], new_jacobian[better]
-            grey[better] = new_grey[better]
-        if iteration > (0 if near else REWEIGH_AT) and np.abs(step[:, :2]).max() < tolerance_px:
-            break
-    return _Optimum(x, grey, residual, weight, jacobian, prior)
-
-
-def _fit_at(band: EdgePixels, at: _Optimum) -> _BandFit:
+def _fit_at(band: EdgePixels, at: Optimum) -> _BandFit:
     """The fit at an optimum for a camera that is linear."""
-    residual, weight, jacobian, diagonal = at.residual, at.weight, at.jacobian, np.arange(PARAMETERS)
-    sigma = _spread(residual, weight, weight)
-    normal = (jacobian * (weight / sigma[:, None] ** 2)[:, None]) @ np.swapaxes(jacobian, 1, 2)
-    normal[:, diagonal, diagonal] += at.prior + 1e-9
+    residual, weight, jacobian = at.residual, at.weight, at.jacobian
+    sigma = _spread(residual, weight)
+    normal, _ = normal_equations(jacobian, weight * column(sigma**-2.0, weight), residual)
+    normal += (at.prior + 1e-9)[..., None] * np.eye(PARAMETERS)
     inverse_normal = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    # The exponent as one more parameter of each edge: the Schur complement of the others.
+    return _BandFit(at.x, inverse_normal, sigma, _between_fields(band, residual, jacobian[:, 0], weight))
+
+
+def _exponent_step(at: Optimum, fit: _BandFit) -> tuple[FloatArray, FloatArray]:
+    """What one Gauss-Newton step would change of the response's exponent (n,), and its information (n,).
+
+    It is one more parameter of each edge: the Schur complement of the others.
+    """
     by_exponent = at.grey * np.log(np.clip(at.grey / WHITE, 1e-3, 1.0))
-    weighed = by_exponent * weight / sigma[:, None] ** 2
-    others = (inverse_normal @ (jacobian @ weighed[..., None]))[..., 0]
-    left = by_exponent - (others[:, None] @ jacobian)[:, 0]
-    information = np.sum(weighed * left, axis=1)
-    gradient = np.sum(left * weight / sigma[:, None] ** 2 * residual, axis=1)
-    step = gradient / np.maximum(information, 1e-9)
-    return _BandFit(
-        at.x,
-        inverse_normal,
-        sigma,
-        step,
-        information,
-        _between_fields(band, residual, jacobian[:, 0], weight),
-    )
+    weighed = by_exponent * at.weight * column(fit.sigma**-2.0, at.weight)
+    others = fit.inverse_normal @ (at.jacobian @ weighed[..., None])
+    left = by_exponent - (others[..., 0].astype(at.grey.dtype)[:, None] @ at.jacobian)[:, 0]
+    information = np.vecdot(weighed, left).astype(np.float64)
+    left *= at.weight * column(fit.sigma**-2.0, at.weight)
+    return np.vecdot(left, at.residual) / np.maximum(information, 1e-9), information
 
 
-def _between_fields(band: EdgePixels, residual: FloatArray, by_offset: FloatArray, weight: FloatArray) -> FloatArray:
+def _between_fields(band: EdgePixels, residual: PixelArray, by_offset: PixelArray, weight: PixelArray) -> FloatArray:
     """Distance (n,) px of an edge on odd lines from that on even ones: interlaced video of something that moved."""
     offset, variance = [], []
     for lines in (band.odd, ~band.odd):
-        information = np.maximum(np.sum(weight * lines * by_offset**2, axis=1), 1e-6)
-        offset.append(np.sum(weight * lines * by_offset * residual, axis=1) / information)
-        mean = np.where(lines, residual - by_offset * offset[-1][:, None], 0.0)
-        variance.append(np.sum(weight * by_offset**2 * mean**2, axis=1) / information**2)
+        weighed = weight * by_offset * lines
+        information = np.maximum(np.vecdot(weighed, by_offset), 1e-6)
+        offset.append(np.vecdot(weighed, residual) / information)
+        rest = residual - by_offset * offset[-1][:, None]
+        variance.append(np.vecdot(weighed * by_offset, np.square(rest)) / information**2)
     apart = np.abs(offset[0] - offset[1])
-    return np.where(apart > 4.0 * np.sqrt(variance[0] + variance[1]), apart, 0.0)
+    return np.where(apart > 4.0 * np.sqrt(variance[0] + variance[1]), apart, 0.0).astype(np.float64)
 
 
-def _asked_exponent(fit: _BandFit, near: BoolArray) -> tuple[float, float]:
+def _asked_exponent(at: Optimum, fit: _BandFit, near: BoolArray) -> tuple[float, float]:
     """The response's exponent that edges ask for which were fitted with 1, and its sigma."""
     light = np.clip(fit.x[near][:, [3, 5]], 1.0, WHITE)
     ratio = np.maximum(np.log(light[:, 1] / light[:, 0]) / np.log(FULL_RATIO), 0.02)
-    variance = 1.0 / np.maximum(fit.exponent_information[near], 1e-6) + (EDGE_ERROR / ratio) ** 2
-    asked = np.clip(1.0 + fit.exponent_step[near], LEAST_EXPONENT, MOST_EXPONENT)
+    step, information = _exponent_step(at, fit)
+    variance = 1.0 / np.maximum(information[near], 1e-6) + (EDGE_ERROR / ratio) ** 2
+    asked = np.clip(1.0 + step[near], LEAST_EXPONENT, MOST_EXPONENT)
     mean, weight = float(np.median(asked)), 1.0 / variance
     for _ in range(5):  # Huber: a spot on an edge asks for anything
         size = np.abs(asked - mean) / np.sqrt(variance)
@@ -312,8 +189,8 @@ def _asked_exponent(fit: _BandFit, near: BoolArray) -> tuple[float, float]:
     return mean, float(np.hypot(weight.sum() ** -0.5, common))
 
 
-def _by_response(band: EdgePixels, linear: _BandFit, near: BoolArray) -> FloatArray:
-    """One sigma (n,) px of o, one error for all edges, because the camera's response to light is not known.
+def _response(band: EdgePixels, at: Optimum, linear: _BandFit, near: BoolArray) -> FloatArray:
+    """One sigma (n,) of o in blurs, one error for all edges, because the camera's response to light is not known.
 
     The edges are fitted for a camera that is linear. One that has about video's response makes dark squares smaller
     and skews the blur: that gives the odds of these two hypotheses, equal before; a second fit says how far apart
@@ -322,7 +199,7 @@ def _by_response(band: EdgePixels, linear: _BandFit, near: BoolArray) -> FloatAr
     nothing = np.zeros(len(linear.x))
     if not near.any():
         return nothing
-    asked, sigma = _asked_exponent(linear, near)
+    asked, sigma = _asked_exponent(at, linear, near)
     spread = np.hypot(sigma, VIDEO_SIGMA)
     log_odds = (
         0.5 * ((asked - 1.0) / sigma) ** 2 + np.log(sigma) - 0.5 * ((asked - VIDEO) / spread) ** 2 - np.log(spread)
@@ -333,55 +210,26 @@ def _by_response(band: EdgePixels, linear: _BandFit, near: BoolArray) -> FloatAr
     start = linear.x.copy()
     start[:, [3, 5]] = WHITE * (np.clip(linear.x[:, [3, 5]], 0.5, WHITE) / WHITE) ** (1.0 / VIDEO)
     start[:, [4, 6]] = 0.0
-    video = _fit_band(band, start, RESPONSE_STEPS, 1e-3, FALL_OFF_COMMON_SIGMA, near=True, exponent=VIDEO)
-    return np.asarray(np.sqrt(video_odds) * np.abs(video.x[:, 0] - linear.x[:, 0]))
+    video = fit_steps(band.some(RESPONSE_PIXELS), start, WITH_RESPONSE, exponent=VIDEO)
+    return np.asarray(np.sqrt(video_odds) * np.abs(video.x[:, 0] - linear.x[:, 0]) * np.exp(-linear.x[:, 2]))
 
 
-def _clean_bins(weight: FloatArray, bins: IntArray) -> BoolArray:
-    """Whether a pixel (n, p) lies where the whole width of the edge is as modelled: a spot spoils what is across it."""
-    total = np.bincount(bins.ravel(), weight.ravel(), minlength=bins.max() + 1)
-    count = np.bincount(bins.ravel(), minlength=bins.max() + 1)
-    return np.asarray((total >= CLEAN_SHARE * count)[bins])
-
-
-def _typical(residual: FloatArray, used: BoolArray, by_offset: FloatArray) -> FloatArray:
-    """Standard deviation (n,) of the pixels about the model where it falls or rises, half of which may be outliers."""
-    size = np.abs(by_offset)
-    chosen = used & (size > STEEP * (size * used).max(axis=1, keepdims=True))
-    out = [_median(np.abs(row[steep])) for row, steep in zip(residual, chosen, strict=True)]
-    return np.maximum(np.array(out) / MEDIAN_SIGMAS, 0.3)
-
-
-def _median(values: FloatArray) -> float:
-    """As ``numpy.median`` of finite values, at a third of its time; 0 of none."""
-    count = len(values)
-    if not count:
-        return 0.0
-    middle = count // 2
-    if count % 2:
-        return float(np.partition(values, middle)[middle])
-    parted = np.partition(values, (middle - 1, middle))
-    return float(0.5 * (parted[middle - 1] + parted[middle]))
-
-
-def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> FloatArray:
+def _spread(residual: PixelArray, weight: PixelArray) -> FloatArray:
     """Standard deviation (n,) of the pixels about the model, at least that of rounding to whole grey levels."""
-    dof = np.maximum(counted.sum(axis=1) - PARAMETERS, 1.0)
-    return np.asarray(np.maximum(np.sqrt(np.sum(weight * residual**2, axis=1) / dof), 0.3))
+    dof = np.maximum(weight.sum(axis=1, dtype=np.float64) - PARAMETERS, 1.0)
+    return np.asarray(np.maximum(np.sqrt(sum_of_squares(weight, residual) / dof), 0.3))
 
 
 def _sections_seen(band: EdgePixels, x: FloatArray, reach: FloatArray, margin_px: FloatArray) -> IntArray:
     """Number (n,) of sections of |u| < reach (n,) with pixels beyond ``margin_px`` (n,) on both sides."""
-    e = band.d - x[:, :1] - x[:, 1:2] * band.u
-    section = np.floor((band.u / reach[:, None] + 1.0) * (SECTIONS / 2)).astype(np.intp)
-    seen = np.zeros((len(x), SECTIONS), dtype=np.int64)
-    edge = np.broadcast_to(np.arange(len(x))[:, None], e.shape)
-    for bit, side in ((1, e > margin_px[:, None]), (2, e < -margin_px[:, None])):
-        chosen = band.used & side & (section >= 0) & (section < SECTIONS)
-        present = np.zeros((len(x), SECTIONS), dtype=bool)
-        present[edge[chosen], section[chosen]] = True
-        seen += bit * present
-    return np.asarray((seen == 3).sum(axis=1))
+    n = len(x)
+    e = band.d - column(x[:, 0], band.d) - column(x[:, 1], band.d) * band.u
+    along = (band.u * column(1.0 / reach, band.u) + 1.0) * (SECTIONS / 2)
+    within = band.used & (along >= 0.0) & (along < SECTIONS)
+    section = along.astype(np.intp) + SECTIONS * np.arange(n)[:, None]
+    margin = column(margin_px, e)
+    above, below = (np.bincount(section[within & side], minlength=SECTIONS * n) for side in (e > margin, e < -margin))
+    return np.asarray(((above > 0) & (below > 0)).reshape(n, SECTIONS).sum(axis=1))
 
 
 def _first_guess(band: EdgePixels, half_width: FloatArray, blur_px: FloatArray) -> FloatArray:
@@ -390,26 +238,41 @@ def _first_guess(band: EdgePixels, half_width: FloatArray, blur_px: FloatArray) 
     x[:, 2] = np.log(blur_px)
     for k, side in ((3, -1.0), (5, 1.0)):
         share = band.used & (side * band.d > 0.5 * half_width[:, None])
-        x[:, k] = [_median(grey[chosen]) for grey, chosen in zip(band.grey, share, strict=True)]
+        x[:, k] = [median(grey[chosen]) for grey, chosen in zip(band.grey, share, strict=True)]
     return x
 
 
 def _locate(
-    camera: CameraModel, image: GreyImage, start: FloatArray, end: FloatArray, cell_px: FloatArray, widest_px: float
+    camera: CameraModel,
+    image: GreyImage,
+    start: FloatArray,
+    end: FloatArray,
+    cell_px: FloatArray,
+    widest_px: float,
+    last: EdgeStart | None = None,
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
     """First pass: (parameters (n, 9), whether an edge is near (n,), light less dark level about the start (n,))."""
     half_width = np.clip(0.55 * cell_px, 2.0, widest_px)
     trim = np.clip(0.12 * np.linalg.norm(end - start, axis=1), 2.0, 12.0)
-    band = edge_pixels(camera, image, start, end, half_width, trim, 40)
-    guess = _first_guess(band, half_width, np.clip(0.35 * half_width, 0.8, 0.3 * widest_px))
-    x = _fit_band(band, guess, 10, 0.02, FALL_OFF_SIGMA, near=False).x
+    band = edge_pixels(camera, image, start, end, half_width, trim, FIRST_ROWS)
+    if last is None:
+        guess = _first_guess(band, half_width, np.clip(0.35 * half_width, 0.8, 0.3 * widest_px))
+        x = fit_steps(band, guess, FIRST).x
+    else:
+        guess = last.parameters
+        x = fit_steps(band, guess, AGAIN).x
     near = (np.abs(x[:, 0]) + np.abs(x[:, 1]) < half_width) & (x[:, 5] - x[:, 3] > MIN_CONTRAST)
     near &= np.exp(x[:, 2]) < MAX_BLUR_PX
     return np.where(near[:, None], x, guess), near, guess[:, 5] - guess[:, 3]
 
 
 def fit_edges(
-    camera: CameraModel, image: GreyImage, start: FloatArray, end: FloatArray, cell_px: FloatArray
+    camera: CameraModel,
+    image: GreyImage,
+    start: FloatArray,
+    end: FloatArray,
+    cell_px: FloatArray,
+    last: EdgeStart | None = None,
 ) -> EdgeFit:
     """Find the sides of black squares near starting segments, dark on the right of their direction as drawn (y down).
 
@@ -418,8 +281,16 @@ def fit_edges(
         start, end: (n, 2) ideal px, the four sides of a square in turn, within about half of ``cell_px`` (and 15 px) of
             the true corners.
         cell_px: (n,) width of the dark band along the edge: limits the pixels used on either side.
+        last: of the same edges in the last picture, where they were about as far off the segments: a start for the
+            first pass, and the camera's response. Where an edge is not found so, all is done without it.
     """
-    length = np.linalg.norm(end - start, axis=1)
+    if last is not None:
+        x, near, step = _locate(camera, image, start, end, cell_px, 8.0, last)
+        near &= np.abs(x[:, :2] - last.parameters[:, :2]).sum(axis=1) < SAME_PLACE_PX
+        if near.all():
+            fit = _fit_about(camera, image, start, end, cell_px, x, near, step, last.response)
+            if fit.good.all():
+                return fit
     x, near, step = _locate(camera, image, start, end, cell_px, 8.0)
     far = np.flatnonzero(~near & (cell_px > 15.0))
     if far.size:
@@ -430,24 +301,49 @@ def fit_edges(
         x[far], near[far], _ = _locate(camera, image, start[far] + outward, end[far] + outward, cell_px[far], 18.0)
         x[far, 0] += shift
 
-    # Second pass: about the line found, with a width that fits its blur.
+    return _fit_about(camera, image, start, end, cell_px, x, near, step, None)
+
+
+def _fit_about(
+    camera: CameraModel,
+    image: GreyImage,
+    start: FloatArray,
+    end: FloatArray,
+    cell_px: FloatArray,
+    x: FloatArray,
+    near: BoolArray,
+    step: FloatArray,
+    response: FloatArray | None,
+) -> EdgeFit:
+    """Second pass: about the lines found, with a width that fits their blur.
+
+    Args:
+        x: (n, 9) parameters of the lines.
+        near: (n,) which were found. step: (n,) as of :class:`EdgeFit`.
+        response: (n,) as of :class:`EdgeStart`; None: to be found out.
+    """
+    length = np.linalg.norm(end - start, axis=1)
     _, _, normal, _ = segment_frames(start, end)
     start2 = start + (x[:, 0] - x[:, 1])[:, None] * normal
     end2 = end + (x[:, 0] + x[:, 1])[:, None] * normal
     blur = np.exp(x[:, 2])
     # Not so wide that the next cell's blur reaches in.
-    half_width2 = np.clip(3.0 * blur + 1.5, 2.0, np.clip(cell_px - 3.5 * blur, 2.0, 14.0))
-    trim2 = np.clip(3.0 * blur + 1.0, 2.0, 0.25 * length)
-    band = edge_pixels(camera, image, start2, end2, half_width2, trim2, MAX_ROWS)
-    # Opposite edges look opposite ways: what their g have in common is a misfit of the blur, not light.
-    x[:, 7] = 0.5 * (x[:, 7] - x[:, 7].reshape(-1, 2, 2)[:, ::-1].ravel())
+    half_width = np.clip(3.0 * blur + 1.5, 2.0, np.clip(cell_px - 3.5 * blur, 2.0, 14.0))
+    trim = np.clip(3.0 * blur + 1.0, 2.0, 0.25 * length)
+    band = edge_pixels(camera, image, start2, end2, half_width, trim, MAX_ROWS)
+    x = x.copy()
     x[:, [0, 1, 8]] = 0.0
     x[:, 2] = np.log(np.clip(blur, 0.4, MAX_BLUR_PX))
-    fit = _fit_at(band, _fit_band(band, x, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True))
-    by_response = _by_response(band, fit, near)
-    cut = np.sum(band.used & (band.grey >= CUT_OFF), axis=1) > CUT_SHARE * np.sum(band.used, axis=1)
-    by_response = np.hypot(by_response, OVEREXPOSED * cut * np.exp(fit.x[:, 2]))
+    # Opposite edges look opposite ways: what their g have in common is a misfit of the blur, not light.
+    x[:, 7] = 0.5 * (x[:, 7] - x[:, 7].reshape(-1, 2, 2)[:, ::-1].ravel())
+    optimum = fit_steps(band, x, SECOND)
+    fit = _fit_at(band, optimum)
     x, inverse_normal, sigma = fit.x, fit.inverse_normal, fit.sigma
+    blur = np.exp(x[:, 2])
+    if response is None:
+        response = _response(band, optimum, fit, near)
+    cut = np.sum(band.used & (band.grey >= CUT_OFF), axis=1) > CUT_SHARE * np.sum(band.used, axis=1)
+    by_response = np.hypot(response, OVEREXPOSED * cut) * blur
 
     # Back to the starting segments' frame: they differ by the small rotation of the first pass.
     middle, direction, _, half_length = segment_frames(start, end)
@@ -459,9 +355,8 @@ def fit_edges(
     slope = (height[:, 1] - height[:, 0]) / (place[:, 1] - place[:, 0])
     line = np.stack([height[:, 0] - slope * place[:, 0], slope], axis=1)
 
-    blur = np.exp(x[:, 2])
     contrast = np.minimum(x[:, 5], WHITE) - x[:, 3]
-    sections = _sections_seen(band, x, 1.0 - 2.0 * trim2 / length, np.minimum(blur, 0.4 * half_width2))
+    sections = _sections_seen(band, x, 1.0 - 2.0 * trim / length, np.minimum(blur, 0.4 * half_width))
     good = (
         near
         & (contrast > np.maximum(MIN_CONTRAST, 4.0 * sigma))
@@ -471,4 +366,5 @@ def fit_edges(
     )
     covariance = inverse_normal[:, :2, :2] + np.square(COMBED * fit.between_fields)[:, None, None] * np.eye(2)
     covariance[:, 0, 0] += np.square(VEIL * blur * np.clip(x[:, 3] / np.maximum(x[:, 5], 1.0), 0.0, 1.0) ** 2)
-    return EdgeFit(line=line, covariance=covariance, blur_px=blur, step=step, good=good, by_response=by_response)
+    again = EdgeStart(np.column_stack([line, x[:, 2:]]), response)
+    return EdgeFit(line, covariance, blur, step, good, by_response, again)

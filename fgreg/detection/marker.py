@@ -7,8 +7,9 @@ fits equally well: then the result is a reason, not a pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, without_strays
 from fgreg.detection.corners import eight_bit, grey, square_corners
 from fgreg.detection.edge_pixels import GreyImage, Image
+from fgreg.detection.edges import EdgeStart
 from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.spoilt_tags import find_spoilt_tags
@@ -28,6 +30,8 @@ from fgreg.model.session_model import MarkerModel
 
 LARGE_WIDTH_PX = 1000
 """In images of at least this width a single tag is first searched at half resolution."""
+LEAST_SIDE_PX = 30.0
+"""Shortest side of tags that were found before, at the resolution at which they are searched again."""
 
 
 def _own_tags(found: list[FoundTag], marker: MarkerModel, view: str) -> tuple[list[FoundTag], list[str]]:
@@ -62,7 +66,7 @@ class ViewCorners:
     (4 n, 2) px of the tags from the detector.
 
     ``others``: tags of the dictionary that are not the body's, as the detector reports them; None where only a part of
-    the image was searched.
+    the image was searched. ``again``: by tag id, what the fit of its edges in the next image may start with.
     """
 
     corners: CornerSet | None
@@ -70,38 +74,57 @@ class ViewCorners:
     left_out: tuple[str, ...]
     outlines_px: FloatArray
     others: tuple[FoundTag, ...] | None = None
+    again: Mapping[int, EdgeStart] = field(default_factory=dict)
 
 
 Window = tuple[int, int, int, int]
 """Part of an image, px: first and last column, first and last row, the last ones exclusive."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Near:
+    """Where the tags were in the last image of this view.
+
+    Attributes:
+        window: the part of the image to be searched.
+        shortest_px: the shortest side of a tag.
+        again: as of :class:`ViewCorners`.
+    """
+
+    window: Window
+    shortest_px: float
+    again: Mapping[int, EdgeStart]
+
+
 def _tags_in(
-    picture: Image, marker: MarkerModel, view: str, near: Window | None
+    picture: Image, marker: MarkerModel, view: str, near: Near | None
 ) -> tuple[list[FoundTag], list[str], tuple[FoundTag, ...] | None]:
     """The body's tags in the whole image or within ``near``, messages about what was left out, and all other tags."""
-    large = len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX
     if near is not None:
-        found = _moved(find_tags(_part(picture, near), marker.dictionary, half=large), near)
-        return *_own_tags(found, marker, view), None
+        shrink = next((times for times in (4, 2) if near.shortest_px >= times * LEAST_SIDE_PX), 1)
+        left, right, top, bottom = near.window
+        part = picture[top:bottom, left:right]
+        found = find_tags(part, marker.dictionary, shrink=shrink, least_px=near.shortest_px)
+        return *_own_tags(_moved(found, near.window), marker, view), None
+    large = len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX
     ids = {tag.id for tag in marker.tags}
     tags: list[FoundTag] = []
     left_out: list[str] = []
     others: list[FoundTag] = []
-    for how in ([{"half": True}] if large else []) + [{}, {"faint": True}]:
-        if tags or (how.get("faint") and left_out):
+    for shrink, faint in ((2, False), (1, False), (2, True))[0 if large else 1 :]:
+        if tags or (faint and left_out):
             break
-        found = find_tags(picture, marker.dictionary, **how)
+        found = find_tags(picture, marker.dictionary, shrink=shrink, faint=faint)
         tags, left_out = _own_tags(found, marker, view)
         others = max(others, [tag for tag in found if tag.id not in ids], key=len)
     return tags, left_out, tuple(others)
 
 
-def _spoilt_tags_in(picture: Image, marker: MarkerModel, near: Window | None) -> list[FoundTag]:
+def _spoilt_tags_in(picture: Image, marker: MarkerModel, near: Near | None) -> list[FoundTag]:
     ids = frozenset(tag.id for tag in marker.tags)
     if near is None:
         return find_spoilt_tags(picture, marker.dictionary, ids)
-    return _moved(find_spoilt_tags(_part(picture, near), marker.dictionary, ids), near)
+    return _moved(find_spoilt_tags(_part(picture, near.window), marker.dictionary, ids), near.window)
 
 
 def _part(picture: Image, window: Window) -> Image:
@@ -129,14 +152,18 @@ def view_corners(
     marker: MarkerModel,
     *,
     edges: bool = True,
-    near: Window | None = None,
+    near: Near | None = None,
 ) -> ViewCorners:
     """The body's corners in one view, ``view`` 0 (left) or 1 (right); ``near``: search only there."""
     picture = grey(image)
     whole_levels = eight_bit(picture)
+    last = {} if near is None else near.again
+    again: dict[int, EdgeStart] = {}
 
     def refined(tags: list[FoundTag]) -> list[CornerSet]:
-        return _corner_sets(tags, picture, camera, view, view_T_camera, marker, edges)
+        sets, starts = _corner_sets(tags, picture, camera, view, view_T_camera, marker, edges, last)
+        again.update(starts)
+        return sets
 
     tags, left_out, others = _tags_in(whole_levels, marker, VIEW_NAMES[view], near)
     sets = refined(tags)
@@ -146,7 +173,7 @@ def view_corners(
         shown = refined(spoilt)
         if sum(corners.numbers for corners in shown) > sum(corners.numbers for corners in sets):
             tags, sets = spoilt, shown
-    return _in_view(tags, sets, left_out, camera, view, others)
+    return replace(_in_view(tags, sets, left_out, camera, view, others), again=again)
 
 
 def _in_view(
@@ -180,7 +207,7 @@ def tag_corners(
 ) -> dict[int, CornerSet]:
     """Refined corners of a body's tags, by id, from what the detector has found in this view already."""
     tags, _ = _own_tags(list(found), marker, VIEW_NAMES[view])
-    sets = _corner_sets(tags, grey(image), camera, view, view_T_camera, marker, edges)
+    sets, _ = _corner_sets(tags, grey(image), camera, view, view_T_camera, marker, edges)
     return {tag.id: corners for tag, corners in zip(tags, sets, strict=True)}
 
 
@@ -192,12 +219,15 @@ def _corner_sets(
     view_T_camera: FloatArray,
     marker: MarkerModel,
     edges: bool,
-) -> list[CornerSet]:
-    """The refined corners of each tag; none where the image's border cuts all of them."""
+    last: Mapping[int, EdgeStart] = MappingProxyType({}),
+) -> tuple[list[CornerSet], dict[int, EdgeStart]]:
+    """The refined corners of each tag, none where the image's border cuts all of them; and by id, what the fit of its
+    edges in the next image may start with."""
     if not tags:
-        return []
-    cells = tag_cells(marker.dictionary)
-    squares = square_corners(camera, picture, np.stack([tag.corners_px for tag in tags]), cells, edges=edges)
+        return [], {}
+    cells, corners_px = tag_cells(marker.dictionary), np.stack([tag.corners_px for tag in tags])
+    begin = [last.get(tag.id) for tag in tags]
+    squares = square_corners(camera, picture, corners_px, cells, edges=edges, last=begin)
     models = {tag.id: tag for tag in marker.tags}
     sets = []
     for k, tag in enumerate(tags):
@@ -217,7 +247,7 @@ def _corner_sets(
                 ideal_by_lens(camera, squares.ideal_px[k][keep]),
             )
         )
-    return sets
+    return sets, {tag.id: start for tag, start in zip(tags, squares.again, strict=True) if start is not None}
 
 
 def detect_marker(
@@ -254,8 +284,13 @@ def right_corners(
     return view_corners(right, rig.right, 1, rig.right_T_left, marker, edges=edges)
 
 
-def marker_from_views(left: ViewCorners | None, right: ViewCorners | None, marker: MarkerModel) -> MarkerFit | NotFound:
-    """The marker's pose from its views; a view without a frame is None. Raises ValueError where both are None."""
+def marker_from_views(
+    left: ViewCorners | None, right: ViewCorners | None, marker: MarkerModel, earlier: MarkerFit | None = None
+) -> MarkerFit | NotFound:
+    """The marker's pose from its views; a view without a frame is None. Raises ValueError where both are None.
+
+    ``earlier``: the fit of an earlier frame, of the same tags, as of :func:`fgreg.detection.body_pose.choose_pose`.
+    """
     seen = [(name, view) for name, view in zip(VIEW_NAMES, (left, right), strict=True) if view is not None]
     if not seen:
         raise ValueError("no frame to detect in")
@@ -269,7 +304,7 @@ def marker_from_views(left: ViewCorners | None, right: ViewCorners | None, marke
     ids = [i for _, view in seen if view.corners is not None for i in view.ids]
     names = [f"tag {i} in {name} view" for name, view in seen if view.corners is not None for i in view.ids]
     kept, strays = without_strays(join(parts), names)
-    pose = choose_pose(kept, "marker", left_out + strays, Constant.TAG_SIZE)
-    if isinstance(pose, NotFound):
-        return pose
-    return MarkerFit(pose, tuple(sorted({ids[int(g)] for g in np.unique(kept.group)})))
+    tags = tuple(sorted({ids[int(g)] for g in np.unique(kept.group)}))
+    before = earlier.pose if earlier is not None and earlier.tags == tags else None
+    pose = choose_pose(kept, "marker", left_out + strays, Constant.TAG_SIZE, before)
+    return pose if isinstance(pose, NotFound) else MarkerFit(pose, tags)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.marker import ViewCorners, Window, view_corners
+from fgreg.detection.marker import Near, ViewCorners, Window, view_corners
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import CameraModel
 from fgreg.model.session_model import MarkerModel
@@ -35,7 +35,8 @@ class MarkerRoi:
         """
         last, found = self._last, None
         if last is not None and not whole:
-            found = self._look(image, window_about(last.outlines_px, (image.shape[0], image.shape[1])))
+            window = window_about(last.outlines_px, (image.shape[0], image.shape[1]))
+            found = self._look(image, Near(window, shortest_side_px(last.outlines_px), last.again))
             if found.corners is None or len(found.outlines_px) < len(last.outlines_px):
                 found = None
         if found is None:
@@ -43,14 +44,20 @@ class MarkerRoi:
         self._last = found if found.corners is not None else None
         return found
 
-    def _look(self, image: npt.NDArray[np.generic], near: Window | None) -> ViewCorners:
+    def _look(self, image: npt.NDArray[np.generic], near: Near | None) -> ViewCorners:
         return view_corners(image, self._camera, self._view, self._view_T_camera, self._marker, near=near)
 
 
+def shortest_side_px(outlines_px: FloatArray) -> float:
+    """Of tags with these outlines (4 n, 2)."""
+    tags = outlines_px.reshape(-1, 4, 2)
+    return float(np.linalg.norm(tags - np.roll(tags, 1, axis=1), axis=2).min())
+
+
 def window_about(outlines_px: FloatArray, shape: tuple[int, int]) -> Window:
-    """Search window in an image of shape (h, w); starts at even pixels, so that halving keeps the pixel grid."""
+    """Search window in an image of shape (h, w); starts where a pixel of every lower resolution does."""
     low, high = outlines_px.min(axis=0), outlines_px.max(axis=0)
     margin = MARGIN * float((high - low).max()) + MARGIN_PX
-    left, top = (2 * int(max(0.0, value - margin) // 2) for value in low)
+    left, top = (4 * int(max(0.0, value - margin) // 4) for value in low)
     right, bottom = (int(np.ceil(value + margin)) + 1 for value in high)
     return left, min(right, shape[1]), top, min(bottom, shape[0])

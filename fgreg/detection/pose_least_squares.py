@@ -142,20 +142,28 @@ class PoseFit:
 
 def corner_residuals(corners: CornerSet, camera_T_body: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
     """(residuals (n, 2) px, Jacobians (n, 2, 6) over the right tangent, whether all corners are in front)."""
+    return _residuals(corners, _by_twist(corners), camera_T_body)
+
+
+def _by_twist(corners: CornerSet) -> FloatArray:
+    """(n, 3, 6) derivatives of the corners by the body's twist, in the body's frame; the same at every pose."""
+    return np.concatenate([-hat(corners.body_p_mm), np.broadcast_to(np.eye(3), (len(corners.view), 3, 3))], axis=2)
+
+
+def _residuals(
+    corners: CornerSet, by_twist: FloatArray, camera_T_body: FloatArray
+) -> tuple[FloatArray, FloatArray, bool]:
+    """:func:`corner_residuals`, of corners whose :func:`_by_twist` is known."""
     view_T_body = corners.view_T_camera @ camera_T_body
     rotation = view_T_body[:, :3, :3]
-    p = np.einsum("nij,nj->ni", rotation, corners.body_p_mm) + view_T_body[:, :3, 3]
+    p = (rotation @ corners.body_p_mm[..., None])[..., 0] + view_T_body[:, :3, 3]
     in_front = bool((p[:, 2] > 1e-3).all())
-    z = np.maximum(p[:, 2], 1e-3)
-    xy = p[:, :2] / z[:, None]
-    residual = corners.focal_px * xy - corners.ideal_px
-    projection = np.zeros((len(z), 2, 3))
-    projection[:, 0, 0] = corners.focal_px[:, 0] / z
-    projection[:, 1, 1] = corners.focal_px[:, 1] / z
-    projection[:, :, 2] = -corners.focal_px * xy / z[:, None]
-    turned = projection @ rotation
-    jacobian = np.concatenate([-turned @ hat(corners.body_p_mm), turned], axis=2)
-    return residual, jacobian, in_front
+    z = np.maximum(p[:, 2:], 1e-3)
+    scale, xy = corners.focal_px / z, p[:, :2]
+    residual = scale * xy - corners.ideal_px
+    # d (f x / z) = f / z (dx - x / z dz)
+    projection = rotation[:, :2] - (xy / z)[..., None] * rotation[:, 2:]
+    return residual, (scale[..., None] * projection) @ by_twist, in_front
 
 
 def whitener(covariance: FloatArray) -> FloatArray:
@@ -163,15 +171,18 @@ def whitener(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
-def fit_pose(corners: CornerSet, start: FloatArray, *, huber: float | None = None) -> PoseFit | None:
+def fit_pose(
+    corners: CornerSet, start: FloatArray, *, huber: float | None = None, settled: float = 1e-9
+) -> PoseFit | None:
     """The minimum next to ``start`` (4, 4), by Levenberg-Marquardt; None where there is none in front of the camera.
 
     Args:
         huber: threshold of the Huber loss, in sigma of a corner (a start for the plain fit); None: plain fit.
+        settled: fall of the cost, relative to 1 + cost, that is the last one.
     """
-    white = whitener(corners.covariance)
+    white, by_twist = whitener(corners.covariance), _by_twist(corners)
     pose, damping = start.copy(), 1e-4
-    residual, jacobian, in_front = corner_residuals(corners, pose)
+    residual, jacobian, in_front = _residuals(corners, by_twist, pose)
     if not in_front:
         return None
 
@@ -194,7 +205,7 @@ def fit_pose(corners: CornerSet, start: FloatArray, *, huber: float | None = Non
             damped = normal + damping * np.diag(np.diag(normal))
             step = np.asarray(-np.linalg.solve(damped, gradient), dtype=np.float64)
             trial = pose @ make_transform(exp_so3(step[:3]), step[3:])
-            new_residual, new_jacobian, in_front = corner_residuals(corners, trial)
+            new_residual, new_jacobian, in_front = _residuals(corners, by_twist, trial)
             new_root, new_cost = weigh(new_residual)
             if in_front and new_cost <= cost:
                 accepted = True
@@ -205,10 +216,10 @@ def fit_pose(corners: CornerSet, start: FloatArray, *, huber: float | None = Non
         drop = cost - new_cost
         pose, residual, jacobian, root, cost = trial, new_residual, new_jacobian, new_root, new_cost
         damping = max(damping * 0.1, 1e-12)
-        if drop <= 1e-9 * (1.0 + cost) or (np.abs(step[:3]).max() < 1e-9 and np.abs(step[3:]).max() < 1e-7):
+        if drop <= settled * (1.0 + cost) or (np.abs(step[:3]).max() < 1e-9 and np.abs(step[3:]).max() < 1e-7):
             break
     pose[:3, :3] = nearest_rotation(pose[:3, :3])
-    residual, jacobian, in_front = corner_residuals(corners, pose)
+    residual, jacobian, in_front = _residuals(corners, by_twist, pose)
     if not in_front or not np.isfinite(pose).all():
         return None
     j = white @ jacobian.reshape(-1, 6)

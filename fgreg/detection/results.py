@@ -5,6 +5,7 @@ Separate from the detectors, so that code that reads results does not load OpenC
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,8 +41,10 @@ class RigidFit:
         views: names of the views used.
         rms_px: root mean square distance of predicted from observed corners, undistorted pixels.
         second_ratio: RMS of the second planar hypothesis over that of this one; infinite where there is no second.
+        clearance: by how much the second hypothesis fits worse, over what makes it ambiguous; infinite where there is
+            no second, None where it was not looked for, because an earlier frame had it out of the question.
         left_out: tags or corners that were seen but not used, with the reason.
-        dependence: of the pose on the rig's constants.
+        tell_dependence: computes :attr:`dependence`, which only poses of events need.
     """
 
     camera_T_body: FloatArray
@@ -53,8 +56,14 @@ class RigidFit:
     views: tuple[str, ...]
     rms_px: float
     second_ratio: float
+    clearance: float | None
     left_out: tuple[str, ...]
-    dependence: CameraDependence
+    tell_dependence: Callable[[], CameraDependence]
+
+    @property
+    def dependence(self) -> CameraDependence:
+        """Of the pose on the rig's constants."""
+        return self.tell_dependence()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from fgreg.detection.edge_pixels import Image
-from fgreg.detection.edges import MIN_CONTRAST
+from fgreg.detection.step_fit import MIN_CONTRAST
 from fgreg.detection.tags import FoundTag, dictionary_named, halved
 from fgreg.geometry.transforms import BoolArray, FloatArray
 

@@ -123,30 +123,39 @@ def detector_parameters() -> cv2.aruco.DetectorParameters:
 
 def halved(image: npt.NDArray[Any]) -> Image:
     """The image at half its resolution: pixel (x, y) of it is (2 x + 0.5, 2 y + 0.5) of the image."""
-    return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    height, width = (size // 2 for size in image.shape[:2])
+    whole = image[: 2 * height, : 2 * width]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def find_tags(image: Image, dictionary: str, *, half: bool = False, faint: bool = False) -> list[FoundTag]:
+def find_tags(
+    image: Image, dictionary: str, *, shrink: int = 1, faint: bool = False, least_px: float = 0.0
+) -> list[FoundTag]:
     """All tags of a dictionary in a grey image (h, w); one id may occur several times.
 
     Args:
-        half: search at half resolution: a quarter of the time, enough for tags of about 40 px and more.
-        faint: search at half resolution and lower contrast, for blurred or noisy tags.
+        shrink: search at this fraction of the resolution, 1, 2 or 4: enough for tags of about 20 px there.
+        faint: search at lower contrast, for blurred or noisy tags.
+        least_px: side of the smallest tag to be found, where that is known: what is much smaller is not looked at.
     """
-    half = half or faint
-    padded = cv2.copyMakeBorder(image, BORDER_PX, BORDER_PX, BORDER_PX, BORDER_PX, cv2.BORDER_REPLICATE)
+    for _ in range(shrink.bit_length() - 1):
+        image = halved(image)
+    border = BORDER_PX // shrink
+    padded = cv2.copyMakeBorder(image, border, border, border, border, cv2.BORDER_REPLICATE)
     parameters = detector_parameters()
-    if half:
-        padded = halved(padded)
     if faint:
         parameters.adaptiveThreshConstant = 3.0
+    if least_px:
+        least_rate = 0.5 * 4.0 * least_px / shrink / max(padded.shape)  # of the perimeter
+        parameters.minMarkerPerimeterRate = max(parameters.minMarkerPerimeterRate, least_rate)
+        # The widest window, 23 px, finds the paper's outline too, and to reject that takes most of the time.
+        parameters.adaptiveThreshWinSizeMax = 13
     detector = cv2.aruco.ArucoDetector(dictionary_named(dictionary), parameters)
     corners, ids, _ = detector.detectMarkers(padded)
     if ids is None:
         return []
-    scale = 2.0 if half else 1.0
     # ids: (n,) in OpenCV 5, (n, 1) in 4.
     return [
-        FoundTag(int(tag_id), (np.asarray(c, dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5 - BORDER_PX)
+        FoundTag(int(tag_id), (np.asarray(c, dtype=np.float64).reshape(4, 2) + 0.5) * shrink - 0.5 - BORDER_PX)
         for tag_id, c in zip(np.asarray(ids).ravel(), corners, strict=True)
     ]

@@ -59,6 +59,7 @@ class MarkerTracker:
         self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
         self._noise: CornerNoise = pool_corner_noise(())
         self._found = 0
+        self._compared: MarkerFit | None = None  # the newest fit in which both poses of a flat marker were compared
         self._waiting: StereoFrame | None = None
         self._flying: tuple[StereoFrame, float] | None = None  # the frame in hand, its exposure's host time
         self._searches_whole, self._whole_s = False, -math.inf  # the frame in hand; when the last such one began
@@ -139,10 +140,13 @@ class MarkerTracker:
         right = views[1] if len(views) > 1 else None
         if self._searches_whole and t_s >= self._from_s:
             self.whole = WholeFrame(t_s, frame, left, right)
-        fit = marker_from_views(left, right, self._marker)
+            self._compared = None
+        fit = marker_from_views(left, right, self._marker, self._compared)
         if isinstance(fit, NotFound):
             self.missing = fit.reason
             return True
+        if fit.pose.clearance is not None:
+            self._compared = fit
         if t_s < self._from_s:  # it would be in another camera frame
             self.missing = "the picture is from before the camera's move ended"
             return True

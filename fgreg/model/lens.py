@@ -33,6 +33,8 @@ UNDISTORT_TOLERANCE = 1e-11
 """Of a root, in normalised coordinates: far below 1e-6 px."""
 WIDEST_RAD = math.radians(89.0)
 """No model is used farther from the axis than this: normalised coordinates end at 90 degrees."""
+LONGEST_STEP = 0.2
+"""Of Newton's method, in normalised coordinates on the axis."""
 _NEAREST_MM = 1.0
 """Points nearer than this to the camera's plane are not seen."""
 _NODES = 256
@@ -51,33 +53,35 @@ def _principal_px(camera: CameraModel) -> FloatArray:
 def distort(camera: CameraModel, normalized: FloatArray) -> FloatArray:
     """Distorted normalised coordinates (..., 2) of ideal normalised points (..., 2)."""
     x, y = normalized[..., 0], normalized[..., 1]
-    r2 = x * x + y * y
-    radial, _ = _radial(camera, r2)
+    x2, y2 = x * x, y * y
+    r2 = x2 + y2
+    out = normalized * _radial(camera, r2)[..., None]
     if camera.fisheye:
-        return np.asarray(normalized * radial[..., None])
+        return np.asarray(out)
     _, _, p1, p2, _, _, _, _, s1, s2, s3, s4 = _coefficients(camera)
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + s2 * r2),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + s4 * r2),
-        ],
-        axis=-1,
-    )
+    mixed = 2.0 * x * y
+    out[..., 0] += p1 * mixed + p2 * (r2 + 2.0 * x2)
+    out[..., 1] += p1 * (r2 + 2.0 * y2) + p2 * mixed
+    if s1 or s2 or s3 or s4:
+        out[..., 0] += r2 * (s1 + s2 * r2)
+        out[..., 1] += r2 * (s3 + s4 * r2)
+    return np.asarray(out)
 
 
 def distort_jacobian(camera: CameraModel, normalized: FloatArray) -> FloatArray:
     """Derivative of :func:`distort` by its argument: (..., 2, 2)."""
     x, y = normalized[..., 0], normalized[..., 1]
     r2 = x * x + y * y
-    radial, slope = _radial(camera, r2)  # d radial / dx = slope * x
+    radial, slope = _radial(camera, r2), _radial_slope(camera, r2)  # d radial / dx = slope * x
     _, _, p1, p2, _, _, _, _, s1, s2, s3, s4 = [0.0] * 12 if camera.fisheye else _coefficients(camera)
-    prism_x, prism_y = 2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2)
-    mixed = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+    by_x = slope * x
     out = np.empty((*np.shape(x), 2, 2))
-    out[..., 0, 0] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x + prism_x * x
-    out[..., 0, 1] = mixed + prism_x * y
-    out[..., 1, 0] = mixed + prism_y * x
-    out[..., 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x + prism_y * y
+    out[..., 0, 0] = radial + by_x * x + (2.0 * p1) * y + (6.0 * p2) * x
+    out[..., 0, 1] = out[..., 1, 0] = by_x * y + (2.0 * p1) * x + (2.0 * p2) * y
+    out[..., 1, 1] = radial + slope * y * y + (6.0 * p1) * y + (2.0 * p2) * x
+    if s1 or s2 or s3 or s4:
+        prism = np.stack([2.0 * (s1 + 2.0 * s2 * r2), 2.0 * (s3 + 2.0 * s4 * r2)], axis=-1)
+        out += prism[..., :, None] * normalized[..., None, :]
     return out
 
 
@@ -87,22 +91,38 @@ def _coefficients(camera: CameraModel) -> list[float]:
     return given + [0.0] * (12 - len(given))
 
 
-def _radial(camera: CameraModel, r2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Radial factor at squared radii r2 (...,), and twice its derivative by r2."""
+def _fisheye_angle(r2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """r and the angle from the axis at squared radii."""
+    r = np.sqrt(np.maximum(r2, 1e-12))  # the limit at the centre is reached well before
+    return r, np.arctan(r)
+
+
+def _radial(camera: CameraModel, r2: FloatArray) -> FloatArray:
+    """Radial factor at squared radii r2 (...,)."""
     if camera.fisheye:
         k1, k2, k3, k4 = (float(value) for value in camera.distortion)
-        r = np.sqrt(np.maximum(r2, 1e-12))  # the limit at the centre is reached well before
-        angle = np.arctan(r)
+        r, angle = _fisheye_angle(r2)
         a2 = angle * angle
-        turned = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
-        by_angle = 1.0 + a2 * (3.0 * k1 + a2 * (5.0 * k2 + a2 * (7.0 * k3 + a2 * 9.0 * k4)))
-        return turned / r, (by_angle * r / (1.0 + r * r) - turned) / r**3
+        return np.asarray(angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) / r)
     k1, k2, _, _, k3, k4, k5, k6, *_ = _coefficients(camera)
     above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    by_above = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
-    by_below = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6)
-    return above / below, 2.0 * (by_above - above / below * by_below) / below
+    return np.asarray(above / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))) if k4 or k5 or k6 else above)
+
+
+def _radial_slope(camera: CameraModel, r2: FloatArray) -> FloatArray:
+    """Twice the derivative of :func:`_radial` by r2."""
+    if camera.fisheye:
+        k1, k2, k3, k4 = (float(value) for value in camera.distortion)
+        r, angle = _fisheye_angle(r2)
+        a2 = angle * angle
+        by_angle = 1.0 + a2 * (3.0 * k1 + a2 * (5.0 * k2 + a2 * (7.0 * k3 + a2 * 9.0 * k4)))
+        return np.asarray((by_angle / (1.0 + r * r) - _radial(camera, r2)) / (r * r))
+    k1, k2, _, _, k3, k4, k5, k6, *_ = _coefficients(camera)
+    by_above = 2.0 * k1 + r2 * (4.0 * k2 + r2 * (6.0 * k3))
+    if not (k4 or k5 or k6):
+        return np.asarray(by_above)
+    by_below = 2.0 * k4 + r2 * (4.0 * k5 + r2 * (6.0 * k6))
+    return np.asarray((by_above - _radial(camera, r2) * by_below) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))))
 
 
 def pixels_from_normalized(camera: CameraModel, normalized: FloatArray) -> FloatArray:
@@ -139,7 +159,7 @@ def _radial_table(distortion: bytes, fisheye: bool) -> tuple[FloatArray, FloatAr
     first = math.sqrt(float(real.min())) if real.size else math.inf
     widest = min((first if fisheye else math.atan(first)) * (1.0 - 1e-9), WIDEST_RAD)  # not at a pole
     radius = np.tan(np.linspace(0.0, widest, _NODES))
-    return radius, radius * _radial(bare, radius * radius)[0]
+    return radius, radius * _radial(bare, radius * radius)
 
 
 def reach(camera: CameraModel) -> float:
@@ -158,25 +178,28 @@ def normalized_from_pixels(camera: CameraModel, pixels: FloatArray) -> FloatArra
         return observed
     # Start: the root of the radial part, along the observed direction.
     radius, distorted = _radial_table(camera.distortion.tobytes(), camera.fisheye)
-    length = np.linalg.norm(observed, axis=-1)
-    start = np.interp(length, distorted, radius) / np.where(length > 0.0, length, 1.0)
-    point = observed * np.where(length > 0.0, start, 1.0)[..., None]
+    length = np.sqrt(np.vecdot(observed, observed))
+    point = observed * (np.interp(length, distorted, radius) / np.maximum(length, 1e-300))[..., None]
     for _ in range(UNDISTORT_ITERATIONS):
         error = distort(camera, point) - observed
         if np.abs(error).max(initial=0.0) < UNDISTORT_TOLERANCE:
             break
         j = distort_jacobian(camera, point)
-        det = j[..., 0, 0] * j[..., 1, 1] - j[..., 0, 1] * j[..., 1, 0]
+        det = _determinant(j)
         det = np.where(np.abs(det) < 1e-8, 1e-8, det)
         step_x = (j[..., 1, 1] * error[..., 0] - j[..., 0, 1] * error[..., 1]) / det
         step_y = (j[..., 0, 0] * error[..., 1] - j[..., 1, 0] * error[..., 0]) / det
         step = np.stack([step_x, step_y], axis=-1)
-        most = 0.2 * (1.0 + np.linalg.norm(point, axis=-1, keepdims=True) ** 2)  # about 11 degrees
-        point = point - step * np.minimum(1.0, most / np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-300))
-        np.clip(point, -radius[-1], radius[-1], out=point)
-    error = np.abs(distort(camera, point) - observed).max(axis=-1)
-    within = np.linalg.norm(point, axis=-1) < radius[-1]
-    good = within & (error < 10.0 * UNDISTORT_TOLERANCE) & (np.linalg.det(distort_jacobian(camera, point)) > 0.0)
+        size2 = np.vecdot(step, step)
+        if size2.max(initial=0.0) > LONGEST_STEP**2:
+            most = LONGEST_STEP * (1.0 + np.vecdot(point, point))  # about 11 degrees
+            step *= np.minimum(1.0, most / np.maximum(np.sqrt(size2), 1e-300))[..., None]
+        point = np.minimum(np.maximum(point - step, -radius[-1]), radius[-1])
+    else:
+        error = distort(camera, point) - observed
+    within = np.vecdot(point, point) < radius[-1] ** 2
+    good = within & (np.abs(error).max(axis=-1) < 10.0 * UNDISTORT_TOLERANCE)
+    good &= _determinant(distort_jacobian(camera, point)) > 0.0
     return np.where(good[..., None], point, np.nan)
 
 
@@ -214,7 +237,7 @@ def ideal_by_lens(camera: CameraModel, ideal: FloatArray) -> FloatArray:
 
     It is how much farther along x and y an ideal pixel (..., 2) would be predicted with these larger.
     """
-    by_pixel = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal))
+    by_pixel = ideal_by_pixel_jacobian(camera, ideal)
     from_centre = pixels_from_ideal(camera, ideal) - _principal_px(camera)
     return np.concatenate([by_pixel @ from_centre[..., None], by_pixel], axis=-1)
 
@@ -245,3 +268,23 @@ def pixel_by_ideal_jacobian(camera: CameraModel, ideal: FloatArray) -> FloatArra
     """Derivative of :func:`pixels_from_ideal`: (..., 2, 2)."""
     f = focal_px(camera)
     return f[:, None] * distort_jacobian(camera, ideal / f) / f
+
+
+def ideal_by_pixel_jacobian(camera: CameraModel, ideal: FloatArray) -> FloatArray:
+    """The inverse of :func:`pixel_by_ideal_jacobian`: (..., 2, 2)."""
+    return inverse_2x2(pixel_by_ideal_jacobian(camera, ideal))
+
+
+def inverse_2x2(matrix: FloatArray) -> FloatArray:
+    """Inverses of (..., 2, 2), at a fraction of the time of ``numpy.linalg.inv``; not finite where there is none."""
+    out = np.empty_like(matrix)
+    out[..., 0, 0], out[..., 1, 1] = matrix[..., 1, 1], matrix[..., 0, 0]
+    out[..., 0, 1], out[..., 1, 0] = -matrix[..., 0, 1], -matrix[..., 1, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out /= _determinant(matrix)[..., None, None]
+    return out
+
+
+def _determinant(matrix: FloatArray) -> FloatArray:
+    """Of (..., 2, 2)."""
+    return np.asarray(matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0])
