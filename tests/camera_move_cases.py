@@ -34,7 +34,7 @@ def everything_about(problem: PackedProblem, state: SharedState) -> Quadratic:
     """Information of all shots of a problem and its priors, about a state of one hypothesis."""
     private = initial_private(problem, state)
     for _ in range(4):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     there = evaluate(problem, state, private)
     return Quadratic(state, float(there.cost[0]), there.gradient[0], there.hessian[0])
 

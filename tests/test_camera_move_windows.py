@@ -55,7 +55,7 @@ def test_whitened_pairs_have_the_reduced_problems_cost_gradient_and_hessian(look
     problem, state = _session(3, 6, looks=looks)
     private = initial_private(problem, state)
     for _ in range(4):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     part = contributions(problem, state, private).pm
     scale = pivot_scale(problem.columns)
     terms = whiten(part, pm_degrees_of_freedom(problem), scale)

@@ -120,7 +120,7 @@ def test_the_cost_is_that_of_the_reduced_graph(case: str) -> None:
         there = replace(state, rotation=turned[None, None], translation_mm=moved[None, None])
         private = private_at(found.problem, there)
         for _ in range(20):
-            _, private = refine(found.problem, there, private)
+            private = refine(found.problem, there, private)
         expected = float(contributions(found.problem, there, private).pm.cost.sum())
         _, _, cost = _best_fit(of, turned, turned.T @ (moved - of.pivot))
         assert cost == pytest.approx(expected, rel=1e-3, abs=1e-6)

@@ -89,8 +89,8 @@ def test_covariance_is_that_of_the_explicit_graph(case: str) -> None:
 def _profile_cost(problem: PackedProblem, state: SharedState) -> float:
     private = initial_private(problem, state)
     for _ in range(12):
-        cost, private = refine(problem, state, private)
-    return float(cost[0])
+        private = refine(problem, state, private)
+    return float(evaluate(problem, state, private).cost[0])
 
 
 def test_gradient_is_the_derivative_of_the_profiled_cost() -> None:

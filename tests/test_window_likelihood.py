@@ -41,7 +41,7 @@ def _case(name: str, pairs: int = 6, seed: int = 3) -> tuple[PackedProblem, Opti
 def _log(problem: PackedProblem, state: SharedState) -> float:
     private = initial_private(problem, state)
     for _ in range(12):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     return float(log_posterior(problem, state, private)[0])
 
 

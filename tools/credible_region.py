@@ -103,7 +103,7 @@ def _from_mode(mode: Mode, state: SharedState) -> FloatArray:
                 mode.mixture.problem,
                 moved_private(mode, step_between(mode.optimum.state, moved, columns)),
             )
-            _, private = refine(problem, moved, private)
-        _, private = refine(problem, moved, private)
+            private = refine(problem, moved, private)
+        private = refine(problem, moved, private)
         log = log_posterior(problem, moved, private)
     return np.where(np.isfinite(log), log, -np.inf)

@@ -111,7 +111,7 @@ def ideal_covariance(
     state.constants[:, Constant.WINDOW_EDGE] = truths[0].window_edge_rad
     private = initial_private(problem, state)
     for _ in range(4):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     hessian = evaluate(problem, state, private).hessian[0]
     scale = 1.0 / np.sqrt(np.diag(hessian))
     return np.asarray(np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)), state

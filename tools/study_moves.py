@@ -69,7 +69,7 @@ def ideal_ratios(
         one = select_pms(problem, np.array([j]))
         private = initial_private(one, state)
         for _ in range(4):
-            _, private = refine(one, state, private)
+            private = refine(one, state, private)
         log = log_posterior(one, state, private)
         out[j] = log[1] - log[0]
     return out

@@ -85,7 +85,7 @@ def truth_state_cost(measurements: Measurements, model: SessionModel, truth: Tru
     state.constants[:, Constant.WINDOW_EDGE] = truth.window_edge_rad
     private = initial_private(problem, state)
     for _ in range(4):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     return np.asarray(contributions(problem, state, private).pm.cost[0])
 
 

@@ -193,7 +193,7 @@ def bound_mm(measurements: Measurements, model: SessionModel, truth: GroundTruth
     state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     private = initial_private(problem, state)
     for _ in range(3):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     hessian = evaluate(problem, state, private).hessian[0]
     if np.linalg.cond(hessian / np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))) > 1e10:
         return math.inf

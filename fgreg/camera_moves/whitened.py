@@ -163,7 +163,7 @@ def settled_private(problem: PackedProblem, state: SharedState) -> PrivateState:
     """The private variables of S states, optimised from the arcs."""
     private = initial_private(problem, state)
     for _ in range(PRIVATE_ROUNDS):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     return private
 
 

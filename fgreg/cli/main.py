@@ -41,6 +41,7 @@ from fgreg.cli.verify import add_verify
 from fgreg.errors import FgregError, InputError
 from fgreg.schema.limits import tell_libraries
 from fgreg.version import __version__
+from fgreg.workers.memory import keep_freed_memory
 from fgreg.workers.threads import one_thread_each
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, a
 def main() -> None:
     """Entry point: known errors become one line and exit status 2."""
     gc.set_threshold(GARBAGE_THRESHOLD)
+    keep_freed_memory()
     take_streams()
     tell_libraries()
     sys.exit(_exit_status(sys.argv[1:]))

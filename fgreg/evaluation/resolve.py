@@ -160,7 +160,7 @@ def predict(registration: Registration, pairs: Sequence[Pair]) -> tuple[HeldOutP
     state = registration.optimum.state
     private = initial_private(problem, state)
     for _ in range(REFINEMENTS):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     parts = pm_contributions(problem, state, private)
     information = registration.optimum.evaluation.hessian[0]
     moved = np.linalg.solve(information + parts.hessian, parts.gradient[..., None])[..., 0]

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -83,6 +84,11 @@ class Evaluation:
     aim_residual: FloatArray
     aim_lambda_mm: FloatArray
 
+    def take(self, index: Any) -> Evaluation:
+        """The hypotheses at ``index`` (anything that indexes an array's first dimension)."""
+        arrays = {name: getattr(self, name)[index] for name in self.__slots__ if name != "private"}
+        return Evaluation(private=self.private.take(index), **arrays)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _System:
@@ -100,7 +106,7 @@ class _System:
             derivatives by shared variables are not wanted); ``look_raw`` the same in mm and rad.
         aim_residual_mm: (A, 2, S) in the chart's coordinates.
         point_step: (J, 3, S), point_covariance: (J, 3, 3, S).
-        pm_cost: (J, S), aim_cost: (A, S), prior_cost: (S,).
+        pm_cost: (J, S), aim_cost: (A, S).
     """
 
     beams: Groups
@@ -121,18 +127,12 @@ class _System:
     point_step: FloatArray
     pm_cost: FloatArray
     aim_cost: FloatArray
-    prior_cost: FloatArray
     private: PrivateState
 
     @property
     def moved_mm(self) -> FloatArray:
         """(J, S) how far the PMs move from the linearisation point."""
         return np.asarray(np.sqrt(np.einsum("nis,nis->ns", self.point_step, self.point_step)))
-
-    @property
-    def cost(self) -> FloatArray:
-        """(S,) chi square of everything."""
-        return np.asarray(self.pm_cost.sum(axis=0) + self.aim_cost.sum(axis=0) + self.prior_cost)
 
 
 def _system(problem: PackedProblem, state: SharedState, private: PrivateState, *, derivatives: bool = False) -> _System:
@@ -215,7 +215,6 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState, *
         point_step=point_step,
         pm_cost=pm_cost,
         aim_cost=line_cost[count:],
-        prior_cost=prior_cost(problem, state),
         private=refined,
     )
 
@@ -240,10 +239,9 @@ def _look_root(weight: FloatArray) -> FloatArray:
     return root
 
 
-def refine(problem: PackedProblem, state: SharedState, private: PrivateState) -> tuple[FloatArray, PrivateState]:
-    """One step of the private variables at fixed shared ones: the cost (S,) and the private variables after it."""
-    system = _system(problem, state, private)
-    return system.cost, system.private
+def refine(problem: PackedProblem, state: SharedState, private: PrivateState) -> PrivateState:
+    """The private variables after one step at fixed shared ones."""
+    return _system(problem, state, private).private
 
 
 def private_at(problem: PackedProblem, state: SharedState) -> PrivateState:
@@ -253,7 +251,7 @@ def private_at(problem: PackedProblem, state: SharedState) -> PrivateState:
     """
     private = initial_private(problem, state)
     for _ in range(3):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     return private
 
 
@@ -273,7 +271,7 @@ def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateSt
     if problem.log_outlier is not None:
         # The chi square of a PM that does not converge is anything, also next to nothing.
         pms = np.logaddexp(np.where(system.moved_mm.T > DIVERGED_MM, -np.inf, pms), problem.log_outlier)
-    return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=0) + system.prior_cost))
+    return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=0) + prior_cost(problem, state)))
 
 
 def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> FloatArray:
@@ -443,7 +441,9 @@ def evaluate(
     """
     system = _system(problem, state, private, derivatives=True)
     by = _shared_derivatives(problem, state, system)
-    weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), system.prior_cost, outer(system.moved_mm)))
+    weights = loss(
+        Costs(outer(system.pm_cost), outer(system.aim_cost), prior_cost(problem, state), outer(system.moved_mm))
+    )
     look, rig, pms = system.look, look_columns(problem.columns), len(problem.beam_pm)
     line, spot, h_ps, look_t = by.line, by.spot, by.h_ps, look[:, :, 4:]
     if loss is not least_squares:

@@ -34,6 +34,11 @@ class Optimum:
     converged: BoolArray
     iterations: int
 
+    def take(self, index: int) -> Optimum:
+        """One of the hypotheses."""
+        one = [index]
+        return Optimum(self.state.take(one), self.evaluation.take(one), self.converged[one], self.iterations)
+
 
 def optimize(
     problem: PackedProblem,
@@ -82,7 +87,7 @@ def optimize(
         points = before.trus_p_pm + (current.point_gain[index] @ step[:, None, :, None])[..., 0]
         ahead = replace(before, trus_p_pm=points)
         if decrement.max() > LONG_STEP:
-            _, ahead = refine(problem, moved, ahead)
+            ahead = refine(problem, moved, ahead)
         trial = evaluate(problem, moved, ahead, loss)
         good = np.isfinite(trial.cost) & (trial.cost <= current.cost[index] + 1e-9 * (1.0 + current.cost[index]))
         stalled = (decrement < STALLED) & (trial.cost >= current.cost[index])

@@ -126,7 +126,7 @@ class _Session:
         """After a step (D,) of all its variables."""
         points = self.at.private.trus_p_pm + (self.at.point_gain @ step[:, None])[..., 0]
         state = self.state.retract(step[None], self.problem.columns)
-        _, private = refine(self.problem, state, replace(self.at.private, trus_p_pm=points))
+        private = refine(self.problem, state, replace(self.at.private, trus_p_pm=points))
         return replace(self, state=state, at=_evaluated(self.problem, state, private, self.slope))
 
     @property

@@ -434,7 +434,7 @@ def _contributions(
     """Cost (n,), gradient (n, D) and Hessian (n, D, D) of virtual pairs at a state, PMs started at (n, 3)."""
     private = replace(initial_private(problem, state), trus_p_pm=trus_p[None])
     for _ in range(REFINEMENTS):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     parts = pm_contributions(problem, state, private)
     return parts.cost, parts.gradient, parts.hessian
 
@@ -459,7 +459,7 @@ def _separate(registration: Registration, epoch: int, found: Candidates) -> _Sep
     for state in (_alone(registration, place), rival.state):
         private = initial_private(problem, state)
         for _ in range(REFINEMENTS):
-            _, private = refine(problem, state, private)
+            private = refine(problem, state, private)
         at = evaluate(problem, state, private)
         hessians.append((float(at.cost[0]), at.hessian[0]))
     (cost, hessian), (rival_cost, rival_hessian) = hessians

@@ -163,7 +163,7 @@ def log_density(mode: Mode, step: FloatArray) -> FloatArray:
     private = moved_private(mode, step)
     with np.errstate(all="ignore"):  # numbers of a sample far off may overflow: its density is then zero
         if len(problem.pms) < REFINED_PMS or mode.mixture is not None:
-            _, private = refine(problem, state, private)
+            private = refine(problem, state, private)
         log = log_posterior(problem, state, private)
         near = (np.linalg.norm(state.translation_mm, axis=-1) <= MOST_TRANSLATION_MM).all(axis=1)
     return np.where(np.isfinite(log) & near, log, -np.inf)
@@ -247,16 +247,18 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
     ]
     x, log_target, nearest = np.zeros((0, columns.size)), np.zeros(0), np.zeros(0, dtype=np.int64)
     counts: list[int] = []
-    log_proposal = np.zeros((0, 0))
+    log_proposal, given = np.zeros((0, 0)), np.zeros((len(modes), 0))
     draws = 300
     while True:
         fresh = proposals[-1].draw(rng, draws)
-        old_under_new = proposals[-1].log(x) if len(x) else np.zeros(0)
-        new_under_all = np.stack([proposal.log(fresh) for proposal in proposals])
+        given_fresh = proposals[0].given(fresh)
+        new_under_all = np.stack([proposal.log(fresh, given_fresh) for proposal in proposals])
         if len(x):
+            old_under_new = proposals[-1].log(x, given)
             log_proposal = np.concatenate([np.concatenate([log_proposal, old_under_new[None]]), new_under_all], axis=1)
         else:
             log_proposal = new_under_all
+        given = np.concatenate([given, given_fresh], axis=1)
         log_fresh, nearest_fresh = target.log(fresh)
         x, log_target = np.concatenate([x, fresh]), np.concatenate([log_target, log_fresh])
         nearest = np.concatenate([nearest, nearest_fresh])

@@ -19,7 +19,7 @@ from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.scaled_inverse import inverse_hessian
-from fgreg.graph.shared_state import SharedState, make_state
+from fgreg.graph.shared_state import SharedState, make_state, stack_states
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.joint_solve import Shots
 from fgreg.registration.multistart import targets_moved
@@ -94,7 +94,7 @@ def _with_all_pms(shots: Shots, problem: PackedProblem) -> PackedProblem:
 def _settled(problem: PackedProblem, state: SharedState) -> PrivateState:
     private = initial_private(problem, state)
     for _ in range(4):
-        _, private = refine(problem, state, private)
+        private = refine(problem, state, private)
     return private
 
 
@@ -154,27 +154,35 @@ def _modes(registration: Registration) -> tuple[Mode, ...]:
     """The optimum's mode first, then those of other minima that have a share of the posterior."""
     problem, best = registration.problem, registration.optimum
     modes = [_with_sites(problem, best, registration.covariance)]
-    targets = registration.model.targets_mm
+    targets, inliers = registration.model.targets_mm, registration.shots.pm_inlier.all()
+    starts, places = list[SharedState](), list[int]()
     for place, epoch in enumerate(registration.epochs):
         minima = registration.searches[epoch].minima
         for minimum in minima:
-            if len(modes) > RIVALS or minimum.cost > minima[0].cost + RIVAL_CHI2:
-                break
             transform = minimum.state.trus_T_camera()[0]
+            if minimum.cost > minima[0].cost + RIVAL_CHI2:
+                break
+            if inliers and np.array_equal(registration.starts[place], transform):
+                continue  # it leads to the optimum
             if targets_moved(best.state.trus_T_camera(place)[0], transform, targets) < 1.0:
                 continue
             transforms = np.stack([best.state.trus_T_camera(k) for k in range(problem.columns.epochs)], axis=1)
             transforms[0, place] = transform
             start = make_state(transforms, best.state.marker_T_nominal[0], best.state.beam)
-            start = replace(start, constants=best.state.constants)
-            found = optimize(problem, start)
-            inverse = inverse_hessian(found.evaluation.hessian[0])
-            cost = float(found.evaluation.cost[0])
-            if inverse is None or not cost < float(best.evaluation.cost[0]) + RIVAL_CHI2:
-                continue
-            others = [mode.optimum.state.trus_T_camera(place)[0] for mode in modes]
-            if all(targets_moved(o, found.state.trus_T_camera(place)[0], targets) > 1.0 for o in others):
-                modes.append(_with_sites(problem, found, inverse))
+            starts.append(replace(start, constants=best.state.constants))
+            places.append(place)
+    if not starts:
+        return (_with_outlier_mixture(registration.shots, modes[0]),)
+    found = optimize(problem, stack_states(starts))
+    for index, place in enumerate(places):
+        one = found.take(index)
+        inverse = inverse_hessian(one.evaluation.hessian[0])
+        cost = float(one.evaluation.cost[0])
+        if len(modes) > RIVALS or inverse is None or not cost < float(best.evaluation.cost[0]) + RIVAL_CHI2:
+            continue
+        others = [mode.optimum.state.trus_T_camera(place)[0] for mode in modes]
+        if all(targets_moved(o, one.state.trus_T_camera(place)[0], targets) > 1.0 for o in others):
+            modes.append(_with_sites(problem, one, inverse))
     return tuple(_with_outlier_mixture(registration.shots, mode) for mode in modes)
 
 
@@ -184,7 +192,7 @@ def _evaluated(problem: PackedProblem, state: SharedState, near: Optimum) -> Opt
     for start in (private, initial_private(problem, state)):
         private = start
         for _ in range(4):
-            cost, private = refine(problem, state, private)
-        if np.isfinite(cost).all():
+            private = refine(problem, state, private)
+        if np.isfinite(private.trus_p_pm).all() and np.isfinite(private.beam_error).all():
             break
     return Optimum(state, evaluate(problem, state, private), near.converged, near.iterations)

@@ -105,7 +105,7 @@ def without_pairs(registration: Registration, place: int) -> WithoutPairs | None
         state, private = state.retract(step, problem.columns), at.private
     lambdas = [optimum.evaluation.aim_lambda_mm[0], optimum.evaluation.lambda_mm[0]]
     distance_mm = float(np.median(np.abs(lambdas[0] if len(lambdas[0]) else lambdas[1])))
-    return WithoutPairs(state, refine(problem, state, private)[1], distance_mm)
+    return WithoutPairs(state, refine(problem, state, private), distance_mm)
 
 
 def other_minima(registration: Registration, place: int, starts: FloatArray, config: SolveConfig) -> tuple[Other, ...]:

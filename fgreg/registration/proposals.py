@@ -11,7 +11,7 @@ from fgreg.geometry.transforms import FloatArray, IntArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.split_points import logsumexp
 
-DEGREES_OF_FREEDOM = 6.0
+DEGREES_OF_FREEDOM = 6
 """Of the Student proposals: tails heavier than the posterior's, else rare samples would have all the weight."""
 KERNELS = 40
 """Number of kernels of a later proposal that are centred on samples of earlier rounds."""
@@ -89,9 +89,14 @@ class Students:
             out[np.ix_(rows, self.linear)] = given.origin + x[rows] @ given.gain.T + noise[rows] @ given.root.T
         return out
 
-    def log(self, samples: FloatArray) -> FloatArray:
-        """(S,) log density of all variables (S, D), up to a constant common to all mixtures."""
+    def given(self, samples: FloatArray) -> FloatArray:
+        """(M, S) log density of the linear constants of samples (S, D), for each mode; all rounds have the same."""
         x, c = samples[:, self.sampled], samples[:, self.linear]
+        return np.stack([mode.log(x, c) for mode in self.conditional])
+
+    def log(self, samples: FloatArray, given: FloatArray) -> FloatArray:
+        """(S,) log density of all variables (S, D), up to a constant common to all mixtures; ``given`` as above."""
+        x = samples[:, self.sampled]
         size = x.shape[1]
         out = []
         for mode, group in sorted({*zip(self.mode.tolist(), self.group.tolist(), strict=True)}):
@@ -103,10 +108,23 @@ class Students:
             centre = np.linalg.solve(root, (self.centre[mine] - origin).T)
             square = np.sum(centre**2, axis=0)[:, None] - 2.0 * centre.T @ at + np.sum(at**2, axis=0)
             square = np.maximum(square, 0.0) / (DEGREES_OF_FREEDOM * self.scale[mine, None] ** 2)
-            kernel = np.exp(-0.5 * (DEGREES_OF_FREEDOM + size) * np.log(1.0 + square))
-            log = np.log((self.share[mine] * self.scale[mine] ** -size) @ kernel) - np.log(np.diag(root)).sum()
-            out.append(log + self.conditional[mode].log(x, c))
+            kernel = _power(np.sqrt(1.0 / (1.0 + square)), DEGREES_OF_FREEDOM + size)
+            with np.errstate(divide="ignore"):  # no density far off
+                log = np.log((self.share[mine] * self.scale[mine] ** -size) @ kernel) - np.log(np.diag(root)).sum()
+            out.append(log + given[mode])
         return logsumexp(np.array(out), axis=0)
+
+
+def _power(base: FloatArray, exponent: int) -> FloatArray:
+    """Powers by repeated squaring, which take a third of the time of exponentials of logarithms."""
+    out = np.ones_like(base)
+    while exponent:
+        if exponent & 1:
+            out = out * base
+        exponent >>= 1
+        if exponent:
+            base = base * base
+    return out
 
 
 def cholesky(covariance: FloatArray) -> FloatArray:

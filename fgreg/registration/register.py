@@ -15,7 +15,7 @@ import numpy as np
 
 from fgreg.errors import EstimationError
 from fgreg.geometry.rig import Constant
-from fgreg.geometry.transforms import FloatArray, inverse
+from fgreg.geometry.transforms import FloatArray, inverse, make_transform
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.scaled_inverse import inverse_hessian
@@ -59,6 +59,7 @@ class Registration:
         ambiguous: the session's epochs in which two minima fit equally well.
         covariance: (D, D) inverse Hessian of the shared variables (``problem.columns``).
         shots: all shots of ``epochs``, inliers and outliers.
+        starts: (E, 4, 4) registrations from which the joint solve started (the first of several).
     """
 
     model: SessionModel
@@ -70,6 +71,7 @@ class Registration:
     ambiguous: tuple[int, ...]
     covariance: FloatArray
     shots: Shots
+    starts: FloatArray
 
     def looks_of(self, measurements: Measurements) -> tuple[Look, ...]:
         """The look of each of the session's pairs, in the position that was taken."""
@@ -308,7 +310,8 @@ def register(
         # The given nominal beam points backwards and no aim shows it: +z points towards the spots.
         start = _turned(optimum.state)
         kept, problem, optimum, shots = solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
-    return _registration(model, tuple(solvable), searches, tuple(sorted(is_open)), (kept, problem, optimum, shots))
+    found = kept, problem, optimum, shots
+    return _registration(model, tuple(solvable), searches, tuple(sorted(is_open)), start, found)
 
 
 def register_near(
@@ -340,7 +343,7 @@ def register_near(
     aims = np.ones(len(mine.aims), dtype=bool)
     found = solve_jointly(mine, packed, start, aims, clean=False)
     searches = tuple(EpochSearch((), None, clean=False) for _ in measurements.epochs)
-    return _registration(model, tuple(epochs), searches, (), found)
+    return _registration(model, tuple(epochs), searches, (), start, found)
 
 
 def _registration(
@@ -348,6 +351,7 @@ def _registration(
     epochs: tuple[int, ...],
     searches: tuple[EpochSearch, ...],
     ambiguous: tuple[int, ...],
+    start: SharedState,
     found: tuple[Measurements, PackedProblem, Optimum, Shots],
 ) -> Registration:
     """A registration from the joint solve, with its covariance.
@@ -369,4 +373,5 @@ def _registration(
         ambiguous=ambiguous,
         covariance=covariance,
         shots=shots,
+        starts=make_transform(start.rotation[0], start.translation_mm[0]),
     )

@@ -67,7 +67,7 @@ def marginal_prior(problem: PackedProblem, state: SharedState) -> tuple[Quadrati
 def _settled(problem: PackedProblem, state: SharedState, private: PrivateState, rounds: int) -> PrivateState:
     with np.errstate(all="ignore"):  # numbers may overflow far from the optimum: the caller checks them
         for _ in range(rounds):
-            _, private = refine(problem, state, private)
+            private = refine(problem, state, private)
     return private
 
 

@@ -120,7 +120,7 @@ def _from_looks(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Plac
 def _settled(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Settled | None:
     """The posterior of the query's PM given its looks; None where it does not converge."""
     problem, state = _one_pm(query, snapshot, epoch)
-    _, private = refine(problem, state, initial_private(problem, state))
+    private = refine(problem, state, initial_private(problem, state))
     start = evaluate(problem, state, private)
     settled = settle(problem, state, start, settled=SETTLED, damping=1.0)
     if settled is None and problem.shapes is not None:  # the windows as Gaussians

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from typing import Any, Protocol, TypeVar
 
+from fgreg.workers.memory import keep_freed_memory
 from fgreg.workers.parent import end_with_parent
 from fgreg.workers.threads import one_thread_each
 
@@ -40,6 +41,12 @@ class Executor(Protocol):
     def submit(self, fn: Callable[..., Any], /, *args: Any) -> Handle: ...
 
 
+def _begin() -> None:
+    """First of all in a worker process."""
+    end_with_parent()
+    keep_freed_memory()
+
+
 class _LocalPool:
     """The cores of this machine. A pool that lost a worker takes nothing more, so that another one follows it."""
 
@@ -57,7 +64,7 @@ class _LocalPool:
                 except BrokenExecutor:
                     self._pool.shutdown(wait=False)
             # spawn: a fork would inherit the threads of the linear algebra libraries in an undefined state.
-            self._pool = ProcessPoolExecutor(self._jobs, get_context("spawn"), end_with_parent)
+            self._pool = ProcessPoolExecutor(self._jobs, get_context("spawn"), _begin)
             return self._pool.submit(fn, *args)
 
     def close(self) -> None:

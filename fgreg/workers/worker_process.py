@@ -17,6 +17,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
+from fgreg.workers.memory import keep_freed_memory
 from fgreg.workers.progress import LOOK_S, Progress
 
 if TYPE_CHECKING:
@@ -326,6 +327,7 @@ def _serve(
     import multiprocessing
 
     os.nice(niceness)
+    keep_freed_memory()
     with suppress(OSError):  # where top and ps have the name from
         Path("/proc/self/comm").write_text(multiprocessing.current_process().name)
     try:

@@ -36,6 +36,7 @@ sys.path.insert(0, os.fspath(Path(__file__).resolve().parents[1]))
 from bench.compare import BUDGET_S, Row, Section, Target, print_rows, print_targets
 from bench.gate import RATIOS, losses, machine, store
 from bench.page import PAGE, write_tables
+from fgreg.workers.memory import keep_freed_memory
 from fgreg.workers.threads import one_thread_each
 
 LEAST_REPEATS = 9
@@ -109,6 +110,7 @@ def main() -> int:
     if unknown := [name for name in args.parts if name not in parts]:
         parser.error(f"no part {unknown[0]}; there are {', '.join(parts)}")
     rows, targets = list[Row](), list[Target]()
+    keep_freed_memory()  # as in fgreg's processes; for all contenders
     begun = machine()
     print(begun, flush=True)
     for name in args.parts or parts:

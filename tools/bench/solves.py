@@ -125,6 +125,6 @@ def bench_judged(repeats: int, seed: int) -> Section:
     targets = [Target(f"full solve of {SMALL} pairs over native factors (star), 1,000 pairs", whole.ratio or 0.0, 3.0)]
     say("judged pairs of two epochs")
     native = native_star(make_case(NATIVE, seed)).run
-    pairs = judged_pairs(native, repeats, seed)
+    pairs = judged_pairs(native, whole.ratio or 1.0, repeats, seed)
     rows += [*pairs.rows]
     return Section(tuple(rows), (*targets, *pairs.targets))
