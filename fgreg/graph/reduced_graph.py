@@ -46,7 +46,7 @@ from fgreg.graph.reduced_blocks import (
     times,
     transposed,
 )
-from fgreg.graph.reduced_priors import add_priors, prior_cost
+from fgreg.graph.reduced_priors import prior_cost, prior_terms
 from fgreg.graph.shared_state import SharedState
 from fgreg.graph.visible_spots import spot_derivatives, spot_rows
 from fgreg.graph.window_likelihood import log_shape_ratios
@@ -364,7 +364,7 @@ class Parts:
 
 def contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Parts:
     """The terms whose sum is :func:`evaluate`."""
-    size, pms = problem.columns.size, len(problem.beam_pm)
+    pms = len(problem.beam_pm)
     system = _system(problem, state, private, derivatives=True)
     by = _shared_derivatives(problem, state, system)
     look, rig = system.look, look_columns(problem.columns)
@@ -380,12 +380,10 @@ def contributions(problem: PackedProblem, state: SharedState, private: PrivateSt
     hessian[..., rig, rig] += outer(system.looks.sum(look_hessian))
     look_gradient = np.einsum("nkis,nks->nis", look[:, :, 4:], look[:, :, 0])
     gradient[..., rig] += outer(system.looks.sum(look_gradient))
-    prior_gradient, prior_hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
-    add_priors(problem, state, prior_gradient, prior_hessian)
     return Parts(
         pm=Contributions(outer(system.pm_cost), gradient, hessian),
         aim=Contributions(outer(system.aim_cost), line_gradient[:, pms:], line_hessian[:, pms:]),
-        prior=Contributions(system.prior_cost[:, None], prior_gradient[:, None], prior_hessian[:, None]),
+        prior=Contributions(*(term[:, None] for term in prior_terms(problem, state))),
         private=system.private,
         point_gain=by.point_gain,
     )
@@ -441,9 +439,8 @@ def evaluate(
     """
     system = _system(problem, state, private, derivatives=True)
     by = _shared_derivatives(problem, state, system)
-    weights = loss(
-        Costs(outer(system.pm_cost), outer(system.aim_cost), prior_cost(problem, state), outer(system.moved_mm))
-    )
+    cost, prior_gradient, prior_hessian = prior_terms(problem, state)
+    weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), cost, outer(system.moved_mm)))
     look, rig, pms = system.look, look_columns(problem.columns), len(problem.beam_pm)
     line, spot, h_ps, look_t = by.line, by.spot, by.h_ps, look[:, :, 4:]
     if loss is not least_squares:
@@ -459,7 +456,8 @@ def evaluate(
         gradient = gradient + _stacked(spot, outer(system.spot)[..., None])
     gradient = (gradient + _stacked(h_ps, outer(system.point_step)[..., None]))[..., 0]
     gradient[:, rig] += np.einsum("nkis,nks->si", look_t, look[:, :, 0])
-    add_priors(problem, state, gradient, hessian)
+    gradient += prior_gradient
+    hessian += prior_hessian
     lambda_mm = outer(along_beam(state, system.laser_p))
     return Evaluation(
         cost=weights.cost,

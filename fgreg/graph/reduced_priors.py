@@ -31,25 +31,33 @@ def prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
     return np.asarray(cost)
 
 
-def add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray, hessian: FloatArray) -> None:
-    """Priors of the shared variables, known points and links between epochs, added in place."""
-    rig = problem.columns.rig
-    gradient[:, rig] += _prior_deviation(problem, state) @ problem.prior.information
-    hessian[:, rig, rig] += problem.prior.information
+def prior_terms(problem: PackedProblem, state: SharedState) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same cost (S,), and gradient (S, D) and Hessian (S, D, D) of half of it."""
+    rig, size = problem.columns.rig, problem.columns.size
+    gradient, hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
+    deviation = _prior_deviation(problem, state)
+    gradient[:, rig] = deviation @ problem.prior.information
+    hessian[:, rig, rig] = problem.prior.information
+    cost = np.sum(deviation * gradient[:, rig], axis=1)
     for link in problem.links:
         residual, jacobian = _link_residual(link, state)
         weighted = link.information @ jacobian
         columns = np.r_[6 * link.old : 6 * link.old + 6, 6 * link.new : 6 * link.new + 6]
         hessian[:, columns[:, None], columns] += transposed(jacobian) @ weighted
         gradient[:, columns] += times(transposed(weighted), residual)
+        cost = cost + np.sum(residual * (residual @ link.information), axis=1)
     if problem.anchor is not None:
         anchor, step = problem.anchor, step_between(problem.anchor.state, state, problem.columns)
+        pull = step @ anchor.hessian
         hessian += anchor.hessian
-        gradient += anchor.gradient + step @ anchor.hessian
+        gradient += anchor.gradient + pull
+        cost = cost + anchor.cost + np.sum(step * (2.0 * anchor.gradient + pull), axis=1)
     if len(problem.points):
         terms = point_terms(problem.points, state, problem.columns)
         gradient += terms.gradient.sum(axis=1)
         hessian += terms.hessian.sum(axis=1)
+        cost = cost + terms.cost.sum(axis=1)
+    return cost, gradient, hessian
 
 
 def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:

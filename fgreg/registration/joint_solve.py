@@ -198,7 +198,7 @@ def solve_jointly(
     deviants = beyond_limit(whole, found, kept[0])
     private = initial_private(whole, optimum.state)
     for _ in range(4):
-        _, private = refine(whole, optimum.state, private)
+        private = refine(whole, optimum.state, private)
     at = evaluate(whole, optimum.state, private)
     looks = tuple(pair.look for pair in measurements.pairs)
     return chosen, problem, optimum, Shots(whole, looks, at, *kept, found, deviants.pm, deviants.aim)

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, hat, inverse, log_so3, transform_points
+from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, inverse, log_so3, transform_points
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem, only_aims, without_aims
-from fgreg.graph.reduced_blocks import PrivateState
+from fgreg.graph.reduced_blocks import PrivateState, cross
 from fgreg.graph.reduced_graph import evaluate, log_posterior, refine
 from fgreg.graph.reduced_solver import Optimum
 from fgreg.graph.shared_state import Quadratic, SharedState, step_between
@@ -85,34 +85,47 @@ class Mode:
     mixture: OutlierMixture | None = None
 
 
-def _expmap_gain(omega: FloatArray) -> FloatArray:
-    """V (..., 3, 3) of SE(3): the translation of ``Expmap(omega, rho)`` is ``V rho``."""
-    angle2 = np.sum(omega * omega, axis=-1)[..., None, None]
+def _expmap_shift(omega: FloatArray, rho: FloatArray) -> FloatArray:
+    """Translations (S, 3) of ``Expmap(omega, rho)``: V rho, V = 1 + a hat(omega) + b hat(omega)^2."""
+    angle2 = np.sum(omega * omega, axis=1, keepdims=True)
     small = angle2 < 1e-8
     angle = np.sqrt(np.where(small, 1.0, angle2))
     a = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(angle)) / angle**2)
     b = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (angle - np.sin(angle)) / angle**3)
-    k = hat(omega)
-    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+    turned = cross(omega, rho)
+    return np.asarray(rho + a * turned + b * cross(omega, turned))
+
+
+def _logmap_shift(omega: FloatArray, shift: FloatArray) -> FloatArray:
+    """Inverse of :func:`_expmap_shift`: rho (S, 3). V^-1 = 1 - hat(omega) / 2 + c hat(omega)^2."""
+    angle2 = np.sum(omega * omega, axis=1, keepdims=True)
+    small = angle2 < 1e-3
+    half = 0.5 * np.sqrt(np.where(small, 1.0, angle2))
+    near = 1.0 / 12.0 + angle2 / 720.0 + angle2**2 / 30240.0
+    c = np.where(small, near, (1.0 - half / np.tan(half)) / (4.0 * half**2))
+    turned = cross(omega, shift)
+    return np.asarray(shift - 0.5 * turned + c * cross(omega, turned))
 
 
 def step_of_tangent(tangent: FloatArray, columns: Columns) -> FloatArray:
     """(S, D) steps of :meth:`SharedState.retract` from deviations with registrations in GTSAM's tangent."""
     step = tangent.copy()
-    for k in range(columns.epochs):
-        omega = tangent[:, 6 * k : 6 * k + 3]
-        step[:, 6 * k + 3 : 6 * k + 6] = (_expmap_gain(omega) @ tangent[:, 6 * k + 3 : 6 * k + 6, None])[..., 0]
+    for turn, shift in _poses(columns):
+        step[:, shift] = _expmap_shift(tangent[:, turn], tangent[:, shift])
     return step
 
 
 def tangent_of_step(step: FloatArray, columns: Columns) -> FloatArray:
     """Inverse of :func:`step_of_tangent`."""
     tangent = step.copy()
-    for k in range(columns.epochs):
-        omega = step[:, 6 * k : 6 * k + 3]
-        shift = step[:, 6 * k + 3 : 6 * k + 6, None]
-        tangent[:, 6 * k + 3 : 6 * k + 6] = np.linalg.solve(_expmap_gain(omega), shift)[..., 0]
+    for turn, shift in _poses(columns):
+        tangent[:, shift] = _logmap_shift(step[:, turn], step[:, shift])
     return tangent
+
+
+def _poses(columns: Columns) -> list[tuple[slice, slice]]:
+    """Columns of each registration's rotation and translation."""
+    return [(slice(6 * k, 6 * k + 3), slice(6 * k + 3, 6 * k + 6)) for k in range(columns.epochs)]
 
 
 def _log_volume(tangent: FloatArray, columns: Columns) -> FloatArray:
@@ -350,7 +363,7 @@ def pose_tangent(first: FloatArray, second: FloatArray) -> FloatArray:
     back = first[:3, :3].T
     omega = log_so3(back @ second[:3, :3])
     shift = back @ (second[:3, 3] - first[:3, 3])
-    return np.concatenate([omega, np.linalg.solve(_expmap_gain(omega), shift)])
+    return np.concatenate([omega, _logmap_shift(omega[None], shift[None])[0]])
 
 
 def weighted_quantile(values: FloatArray, weight: FloatArray, quantile: float) -> FloatArray:

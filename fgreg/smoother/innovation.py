@@ -98,7 +98,7 @@ def _parts(measurements: Measurements, state: SharedState, setting: Setting) -> 
     private = initial_private(problem, state)
     with np.errstate(all="ignore"):  # numbers of an outlier may overflow
         for _ in range(PRIVATE_ROUNDS):
-            _, private = refine(problem, state, private)
+            private = refine(problem, state, private)
         parts = contributions(problem, state, private)
     diverged = np.linalg.norm(parts.private.trus_p_pm - private.trus_p_pm, axis=-1) > DIVERGED_MM
     cost = np.where(diverged, np.maximum(parts.pm.cost, DIVERGED_CHI2), parts.pm.cost)
