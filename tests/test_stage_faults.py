@@ -228,6 +228,7 @@ def test_tests_that_the_table_of_faults_names_are_there() -> None:
     root = Path(__file__).parents[1]
     table = (root / "docs" / "stage.md").read_text(encoding="utf-8").split("## Faults")[1].split("##")[0]
     named = re.findall(r"`(test_\w+)`", table)
-    sources = "".join(path.read_text(encoding="utf-8") for path in root.glob("tests/test_*stage*.py"))
+    paths = [*root.glob("tests/test_*stage*.py"), root / "tests" / "test_ros2.py"]
+    sources = "".join(path.read_text(encoding="utf-8") for path in paths)
     assert len(named) >= 15
     assert [name for name in named if f"def {name}(" not in sources] == []

@@ -19,9 +19,9 @@ from fgreg.html_report import figures, target_map, words
 from fgreg.html_report.words import degrees, number, percent, vector
 from fgreg.model.estimate import EpochEstimate, PairEstimate, SessionEstimate, SettingsUsed, TrackEstimate, Verdict
 from fgreg.model.events import CameraMovedEvent, Event, NoteEvent, PairEvent, RefusedEvent, StageEvent
+from fgreg.model.known_points import nis_limit
 from fgreg.model.session_model import SessionModel
 from fgreg.model.systematic import TEXTS, largest_causes
-from fgreg.registration.known_points import nis_limit
 
 MOST_PAIRS = 400
 """Looks listed; of more the unused ones and those with the largest NIS."""

@@ -127,10 +127,11 @@ class Status:
 
     @property
     def words(self) -> tuple[CommandKind, ...]:
-        """The words that have an effect now, a stop last."""
+        """The words that have an effect now, a stop first."""
         recorder, plane = self.recorder, self.plane
         usable = recorder.registration.registered and self.verdict is not Verdict.REFUSED
         work = {
+            CommandKind.STOP: True,
             CommandKind.RESET: bool(self.latched),
             CommandKind.AIM: self.stage == Stage.AIMING,
             CommandKind.REGISTER: self.stage == Stage.AIMING,
@@ -144,7 +145,6 @@ class Status:
             CommandKind.VERIFY: plane is not None and usable,
             CommandKind.EXCLUDE: bool(recorder.pms - recorder.excluded),
             CommandKind.INCLUDE: bool(recorder.excluded),
-            CommandKind.STOP: True,
         }
         return tuple(kind for kind, works in work.items() if works)
 

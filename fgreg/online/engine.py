@@ -37,9 +37,10 @@ from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
+from fgreg.registration.epoch_verdicts import EpochReport
 from fgreg.registration.epochs import FinishedEpochs, epoch_chains, has_registration, last_epoch
 from fgreg.registration.multistart import EpochSearch
-from fgreg.registration.solve import EpochReport, Solution, solve
+from fgreg.registration.solve import Solution, solve
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
 from fgreg.smoother.marginal_prior import has_moved

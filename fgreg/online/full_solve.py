@@ -22,11 +22,12 @@ from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
+from fgreg.registration.epoch_verdicts import EpochReport
 from fgreg.registration.epochs import FinishedEpochs
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.posterior import pose_tangent
 from fgreg.registration.register import Registration, register
-from fgreg.registration.solve import EpochReport, Solution, solve
+from fgreg.registration.solve import Solution, solve
 from fgreg.registration.verdict import worst_first
 from fgreg.smoother.initialise import Initial, initial_of
 from fgreg.smoother.marginal_prior import has_moved

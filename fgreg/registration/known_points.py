@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtri
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.known_points import point_terms
 from fgreg.graph.reduced_graph import Contributions
 from fgreg.model.estimate import PointEstimate, Verdict
+from fgreg.model.known_points import nis_limit
 from fgreg.model.measurements import Measurements
 from fgreg.registration.checks import direction_text
 from fgreg.registration.outliers import innovations_of
 from fgreg.registration.register import Registration
 from fgreg.registration.verdict import Condition
-
-CONTRADICTS_P = 1e-3
-"""A point that fits deviates by more than its limit with at most this probability, all points together."""
 
 
 def read_points(
@@ -48,11 +45,6 @@ def read_points(
         out.append(PointEstimate(point.t, point.epoch, used=True, error_mm=error, nis=seen))
         place += 1
     return tuple(out)
-
-
-def nis_limit(points: Sequence[PointEstimate]) -> float:
-    """NIS from which a point contradicts the other shots."""
-    return float(chdtri(3, CONTRADICTS_P / max(sum(point.nis is not None for point in points), 1)))
 
 
 def point_conditions(points: Sequence[PointEstimate], measurements: Measurements) -> list[Condition]:
