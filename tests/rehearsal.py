@@ -203,7 +203,7 @@ class Rehearsal:
             answer,
             self._aims,
             None if self._tags is None else self._tags.moving_since_s,
-            math.inf if self._tags is None else self._tags.still_until_s(now),
+            math.inf if self._tags is None else self._tags.still_until_s(),
         )
         self._said = []
         for action in self.workflow.step(view):

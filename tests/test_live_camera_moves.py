@@ -203,8 +203,8 @@ class Tags:
         ended, self.ended = self.ended, None
         return ended
 
-    def still_until_s(self, now_s: float) -> float:
-        return now_s
+    def still_until_s(self) -> float:
+        return float("inf")
 
     def news(self) -> list[str]:
         return []

@@ -124,21 +124,27 @@ def test_a_bump_is_noticed_within_two_frames_and_measured_once_the_camera_rests(
 
 
 def test_the_marker_is_followed_as_far_as_a_frame_shows_the_tags_in_their_place(pictures: Pictures) -> None:
-    assert pictures.tags.still_until_s(0.0) == math.inf, "nothing is known of the tags yet"
+    assert pictures.tags.still_until_s() == math.inf, "nothing is known of the tags yet"
     pictures.frames(30)
-    assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s
+    assert pictures.tags.still_until_s() == pictures.now_s
     rested_s = pictures.now_s
     pictures.bump()
     pictures.frames(1)
-    assert pictures.tags.still_until_s(pictures.now_s) == rested_s
+    assert pictures.tags.still_until_s() == rested_s
     assert pictures.tags.moving_since_s is None, "one frame may be wrong"
     pictures.bump(inverse(BUMP))
     pictures.frames(1)
-    assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s
+    assert pictures.tags.still_until_s() == pictures.now_s
     pictures.poses.clear()
     pictures.frames(1)
-    assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s - 0.7
-    assert pictures.tags.still_until_s(pictures.now_s + UNSEEN_S) == math.inf, "the tags are out of view"
+    assert pictures.tags.still_until_s() == pictures.now_s - 0.7
+    pictures.frames(math.ceil(2.0 * UNSEEN_S / 0.7))
+    assert pictures.tags.still_until_s() < pictures.now_s - UNSEEN_S, (
+        "tags out of view may be so since the camera moved"
+    )
+    assert len([text for text in pictures.told if "no static tag is in view" in text]) == 1
+    pictures.tags.begin_again()
+    assert pictures.tags.still_until_s() == math.inf, "the operator has said that it moved"
 
 
 def test_a_shift_that_the_poses_do_not_call_a_move_ends(pictures: Pictures, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +157,7 @@ def test_a_shift_that_the_poses_do_not_call_a_move_ends(pictures: Pictures, monk
         assert pictures.frames(12) is None
         assert pictures.tags.moving_since_s is None
         assert pictures.told == [static_tags.BACK]
-        assert pictures.tags.still_until_s(pictures.now_s) == pictures.now_s
+        assert pictures.tags.still_until_s() == pictures.now_s
 
 
 @pytest.mark.parametrize(("shift_mm", "recorded"), [(0.1, False), (0.25, True)])

@@ -95,6 +95,14 @@ def test_a_tag_that_comes_into_view_after_a_move_is_not_learnt_in_its_place(view
     assert [views.frame() for _ in range(2 * FIRST_FRAMES)] == [False] * (2 * FIRST_FRAMES)
 
 
+def test_where_all_known_tags_are_out_of_view_no_other_is_learnt(views: Views) -> None:
+    views.corners.begin_again()
+    views.shown = {1}
+    assert [views.frame() for _ in range(FIRST_FRAMES + 1)] == [None] * FIRST_FRAMES + [True]
+    views.shown = {2, 3}
+    assert [views.frame() for _ in range(2 * FIRST_FRAMES)] == [None] * (2 * FIRST_FRAMES)
+
+
 def test_without_a_known_tag_in_view_nothing_is_said(views: Views) -> None:
     views.shown = set()
     assert views.frame() is None

@@ -54,6 +54,8 @@ class TagCorners:
             shifts[tag] = max(shifts.get(tag, 0.0), shift / self._limit_px[view])
         if shifts and sorted(shifts.values())[len(shifts) // 2] > 1.0:
             return False
+        if known and not shifts:  # the camera may have moved: others are not learnt where they are now
+            return None
         for key, centre in centres.items():
             place, count = self._at.get(key, (centre, 0))
             self._at[key] = place + (centre - place) / (count + 1), min(count + 1, LAST_FRAMES - 1)

@@ -350,7 +350,7 @@ class LiveLoop:
             self._tracking,
             state.aims,
             self._camera_moving_s,
-            self._static_tags.still_until_s(now),
+            self._static_tags.still_until_s(),
         )
 
     # --- out --------------------------------------------------------------------------------------------------------

@@ -34,6 +34,8 @@ from fgreg.camera_moves.tag_corners import TagCorners
 from fgreg.camera_moves.view_shift import view_shift_mm
 from fgreg.detection.corners import grey
 from fgreg.detection.static_tags import BOARD, StaticView, static_poses
+from fgreg.drivers.base import CommandKind
+from fgreg.drivers.operator_words import spelt
 from fgreg.geometry.transforms import FloatArray
 from fgreg.live.marker_tracker import WholeFrame
 from fgreg.live.pa_worker import Locator
@@ -52,7 +54,11 @@ UNREST_S = 12.0
 MOST_ALARMS, ALARMS_S = 4, 300.0
 """More alarms in this time than any bumped scope gives: the tags are not static."""
 UNSEEN_S = 3.0
-"""Where no tag was seen for this long the tags say nothing of the camera."""
+"""Once no tag was seen for this long the operator is told."""
+UNSEEN = (
+    "no static tag is in view: a camera move would not show, so the stage does not follow; if the camera was moved, "
+    f"say {spelt(CommandKind.MOVED)}"
+)
 SHIFTED_FRAMES = 2
 """Frames in a row with the tags out of their place, from which on the camera counts as moving."""
 BACK_SHARE = 0.5
@@ -102,6 +108,7 @@ class StaticTags:
         self._shifted: list[float] = []  # host times of frames since then with the tags elsewhere
         self._fitted = 0  # number of those whose poses are known
         self._alarm_since_s: float | None = None
+        self._unseen = False  # no tag is in view, and the operator was told
         self.frames = 0
         self.next_s = -np.inf
 
@@ -117,9 +124,12 @@ class StaticTags:
             return self._alarm_since_s
         return self._shifted[0] if len(self._shifted) >= SHIFTED_FRAMES else None
 
-    def still_until_s(self, now_s: float) -> float:
-        """Host time of the newest frame that shows the tags in their place; infinite where they say nothing."""
-        return self._rest_s if now_s - self._seen_s <= UNSEEN_S else np.inf
+    def still_until_s(self) -> float:
+        """Host time of the newest frame that shows the tags in their place; infinite where none is known yet.
+
+        Tags that are out of view show nothing, but may be so because the camera has moved.
+        """
+        return self._rest_s if self._tags and np.isfinite(self._seen_s) else np.inf
 
     def news(self) -> list[str]:
         """Messages about tags since the last call."""
@@ -155,6 +165,10 @@ class StaticTags:
             if now_s >= self.next_s and not self._locator.busy and (self._in_view(whole) or board):
                 self._newest = whole
                 self._submit(whole, now_s, board)
+        unseen = bool(self._tags) and np.isfinite(self._seen_s) and now_s - self._seen_s > UNSEEN_S
+        if unseen and not self._unseen:
+            self._news.append(UNSEEN)
+        self._unseen = unseen
         return move
 
     def _test_corners(self, whole: WholeFrame, now_s: float) -> None:
