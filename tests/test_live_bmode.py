@@ -78,7 +78,8 @@ def scanner() -> Iterator[Scanner]:
 @pytest.fixture
 def live(scanner: Scanner, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[LiveLoop, Notes]]:
     monkeypatch.setattr(tcp_link, "RETRY_S", 0.02)
-    device = BkOemScanner(Endpoint("127.0.0.1", scanner.port))
+    # By default it counts as lost after 0.8 s of silence, and a pause of this machine may take that long.
+    device = BkOemScanner(Endpoint("127.0.0.1", scanner.port), silent_s=10.0)
     notes, quiet = Notes(), cast("Any", Quiet())
     session = model()
     loop = LiveLoop(
