@@ -78,8 +78,7 @@ def scanner() -> Iterator[Scanner]:
 @pytest.fixture
 def live(scanner: Scanner, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[LiveLoop, Notes]]:
     monkeypatch.setattr(tcp_link, "RETRY_S", 0.02)
-    # By default it counts as lost after 0.8 s of silence, and a pause of this machine may take that long.
-    device = BkOemScanner(Endpoint("127.0.0.1", scanner.port), silent_s=10.0)
+    device = BkOemScanner(Endpoint("127.0.0.1", scanner.port))
     notes, quiet = Notes(), cast("Any", Quiet())
     session = model()
     loop = LiveLoop(
@@ -129,6 +128,8 @@ def test_pictures_not_fetched_in_time_are_counted(
 ) -> None:
     loop, _ = live
     monkeypatch.setattr(tcp_link, "QUEUE_ITEMS", 4)
+    # A pause of this machine may take the 0.8 s after which a silent scanner is lost.
+    monkeypatch.setattr(cast("Any", loop._devices.bmode)._link, "_silent_s", 10.0)
     loop.turn()
     assert loop._devices.bmode is not None
     sent = pictures(9, 1)
