@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -45,7 +46,7 @@ class Rejections:
             self.link.add(self.last)
 
 
-class Decoder(Generic[Item]):
+class Decoder(ABC, Generic[Item]):
     """Bytes of one connection to messages.
 
     Args:
@@ -64,10 +65,10 @@ class Decoder(Generic[Item]):
         self.replies: list[bytes] = []
 
     @property
+    @abstractmethod
     def partial(self) -> bool:
         """Whether a message has begun and is not complete."""
-        raise NotImplementedError
 
+    @abstractmethod
     def feed(self, data: bytes, host_s: float) -> list[Item]:
         """Messages completed by ``data``, which arrived at ``host_s``. Raises StreamBroken."""
-        raise NotImplementedError

@@ -46,7 +46,7 @@ CONFIG = SolveConfig()
 NOTHING, WARNING, REFUSED = None, Verdict.WARNING, Verdict.REFUSED
 
 
-def only(found: list[Condition], verdict: Verdict | None, *texts: str) -> None:
+def assert_only(found: list[Condition], verdict: Verdict | None, *texts: str) -> None:
     """Nothing, or one condition of this verdict that says these texts."""
     assert [condition.verdict for condition in found] == ([] if verdict is None else [verdict]), found
     for text in texts:
@@ -78,23 +78,23 @@ def search(*costs: float, mirrored: float | None = None, **more: Any) -> EpochSe
 def test_shares_of_outliers(out: int, total: int, verdict: Verdict | None, says: tuple[str, ...]) -> None:
     number = np.arange(total)
     kept, nis = number >= out, np.where(number < out, 41.0 + number, 1.0)
-    only(left_out(kept, nis, "pairs", SURE_OF_PAIRS), verdict, *says)
+    assert_only(left_out(kept, nis, "pairs", SURE_OF_PAIRS), verdict, *says)
     assert (SURE_OF_PAIRS, SURE_OF_AIMS) == (9, 6)
 
 
 def test_what_is_left_out_by_hand_is_counted_and_named() -> None:
     pm, other = ExcludedShot("pair", 5, 1.0, pm=3), ExcludedShot("pair", 6, 1.0, pm=4)
     aim, point = ExcludedShot("aim", 1, 0.0, aim=2), ExcludedShot("point", 7, 2.0, point=0)
-    only(by_hand([], 10), NOTHING)
-    only(by_hand([pm], 10), WARNING, "1 of 11 shots was left out by hand (PM 3)")
-    only(by_hand([aim, pm, other], 10), WARNING, "3 of 13 shots were left out by hand (PM 3 to 4; aim 2)")
-    only(by_hand([point], 0), WARNING, "1 of 1 shots was left out by hand (known point 0)")
+    assert_only(by_hand([], 10), NOTHING)
+    assert_only(by_hand([pm], 10), WARNING, "1 of 11 shots was left out by hand (PM 3)")
+    assert_only(by_hand([aim, pm, other], 10), WARNING, "3 of 13 shots were left out by hand (PM 3 to 4; aim 2)")
+    assert_only(by_hand([point], 0), WARNING, "1 of 1 shots was left out by hand (known point 0)")
 
 
 def test_refused_shots_are_counted_with_the_first_reason() -> None:
-    only(refused_shots([]), NOTHING)
-    only(refused_shots(["a crash", "b"]), WARNING, "(2; the first: a crash)")
-    only(refused_shots(["y" * 500]), WARNING, f"the first: {'y' * 97}...)")
+    assert_only(refused_shots([]), NOTHING)
+    assert_only(refused_shots(["a crash", "b"]), WARNING, "(2; the first: a crash)")
+    assert_only(refused_shots(["y" * 500]), WARNING, f"the first: {'y' * 97}...)")
 
 
 def mask(total: int, *places: int) -> BoolArray:
@@ -104,21 +104,23 @@ def mask(total: int, *places: int) -> BoolArray:
 def test_mild_misfits_are_noise() -> None:
     nis = np.full(35, 1.5)
     nis[[3, 4, 5]] = 16.0, 59.5, 60.0
-    only(understated_noise(mask(35, 3), nis), NOTHING)
-    only(understated_noise(mask(35, 3, 5), nis), NOTHING)
-    only(understated_noise(mask(35, 3, 4), nis), WARNING, "residuals of 2 of 35 shots", "(nis 16 to 60)")
+    assert_only(understated_noise(mask(35, 3), nis), NOTHING)
+    assert_only(understated_noise(mask(35, 3, 5), nis), NOTHING)
+    assert_only(understated_noise(mask(35, 3, 4), nis), WARNING, "residuals of 2 of 35 shots", "(nis 16 to 60)")
     nis[10:30] = 200.0  # among so many gross outliers two mild ones are as expected
-    only(understated_noise(mask(35, 3, 4, *range(10, 30)), nis), NOTHING)
+    assert_only(understated_noise(mask(35, 3, 4, *range(10, 30)), nis), NOTHING)
 
 
 def test_a_shot_that_does_not_fit_among_too_few_is_named() -> None:
     nis = np.array([1.0, 30.0, 20.0, 99.0])
     names = [f"PM {pm}" for pm in range(4)]
     kept = np.array([True, True, True, False])
-    only(too_few_to_tell(mask(4, 3), kept, nis, names), NOTHING)
-    only(too_few_to_tell(mask(4, 2, 1, 3), kept, nis, names), WARNING, "PM 1 does not fit", "(nis 30.0), and 3 are too")
+    assert_only(too_few_to_tell(mask(4, 3), kept, nis, names), NOTHING)
+    assert_only(
+        too_few_to_tell(mask(4, 2, 1, 3), kept, nis, names), WARNING, "PM 1 does not fit", "(nis 30.0), and 3 are too"
+    )
     nis[2] = 30.1
-    only(too_few_to_tell(mask(4, 2, 1, 3), kept, nis, names), REFUSED, "PM 2 does not fit the others (nis 30.1)")
+    assert_only(too_few_to_tell(mask(4, 2, 1, 3), kept, nis, names), REFUSED, "PM 2 does not fit the others (nis 30.1)")
 
 
 @pytest.mark.parametrize(
@@ -143,7 +145,7 @@ def test_odds_of_a_camera_move_at_any_split_point(
     pms: int, somewhere: float, wrong: float, verdict: Verdict | None, says: tuple[str, ...]
 ) -> None:
     doubt = MoveDoubt(math.log(somewhere * (pms - 1)), 4, 7, pms, wrong)
-    only(possible_camera_move(doubt, 3.0), verdict, *says)
+    assert_only(possible_camera_move(doubt, 3.0), verdict, *says)
 
 
 @pytest.mark.parametrize(
@@ -158,9 +160,9 @@ def test_odds_of_a_camera_move_at_any_split_point(
 def test_odds_of_a_camera_move_among_very_few(
     log_odds: float, wrong: float, verdict: Verdict | None, says: tuple[str, ...]
 ) -> None:
-    only(possible_camera_move(MoveDoubt(log_odds, 1, 2, 3, wrong), 3.0), verdict, *says)
+    assert_only(possible_camera_move(MoveDoubt(log_odds, 1, 2, 3, wrong), 3.0), verdict, *says)
     if log_odds > 100.0:
-        only(possible_camera_move(MoveDoubt(log_odds, 1, 2, 30, wrong), 3.0), verdict, *says)
+        assert_only(possible_camera_move(MoveDoubt(log_odds, 1, 2, 30, wrong), 3.0), verdict, *says)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,7 @@ def test_parallel_beams_and_spots_on_a_line(deg: float, away_mm: float, verdict:
     tilt = math.radians(deg)
     beams = np.stack([math.sin(tilt) * np.cos(around), math.sin(tilt) * np.sin(around), np.full(4, math.cos(tilt))], 1)
     spots = 30.0 + np.array([[x, y, 0.0] for x in (-10.0, 10.0) for y in (-away_mm, away_mm)])
-    only(spread(beams, spots, CONFIG), verdict, says)
+    assert_only(spread(beams, spots, CONFIG), verdict, says)
 
 
 def looks(*shots: tuple[int, int, int]) -> Any:
@@ -192,29 +194,29 @@ def test_sweeps_from_both_sides() -> None:
     def of(up: int, down: int) -> Any:
         return looks(*((pm, 1, pm) for pm in range(up)), *((pm, -1, pm) for pm in range(down)), (99, 0, 99))
 
-    only(sweeps(of(0, 0), CONFIG), NOTHING)
-    only(sweeps(of(8, 3), CONFIG), NOTHING)
-    only(sweeps(of(8, 2), CONFIG), WARNING, "8 of 10 sweeps went one way", "both sides (at least 1)")
-    only(sweeps(of(0, 4), CONFIG), WARNING, "4 of 4 sweeps went one way", "both sides (at least 3)")
+    assert_only(sweeps(of(0, 0), CONFIG), NOTHING)
+    assert_only(sweeps(of(8, 3), CONFIG), NOTHING)
+    assert_only(sweeps(of(8, 2), CONFIG), WARNING, "8 of 10 sweeps went one way", "both sides (at least 1)")
+    assert_only(sweeps(of(0, 4), CONFIG), WARNING, "4 of 4 sweeps went one way", "both sides (at least 3)")
     assert two_sided(looks((0, 1, 0), (0, -1, 0), (1, 1, 1), (1, -1, 1), (2, 1, 2)))
     assert not two_sided(looks((0, 1, 0), (0, -1, 0), (1, 1, 1), (1, 0, 1)))
     assert not two_sided(looks((0, 1, 0), (1, -1, 1), (2, 0, 2)))
 
 
 def test_one_marker_observation_at_several_pms() -> None:
-    only(repeated_markers(looks((0, 0, 5), (0, 0, 5), (1, 0, 6))), NOTHING)
+    assert_only(repeated_markers(looks((0, 0, 5), (0, 0, 5), (1, 0, 6))), NOTHING)
     shared = looks((4, 0, 5), (0, 0, 5), (1, 0, 6), (2, 0, 6))
-    only(repeated_markers(shared), WARNING, "2 marker observations serve several PMs (PM 0, 4)")
+    assert_only(repeated_markers(shared), WARNING, "2 marker observations serve several PMs (PM 0, 4)")
 
 
 def test_chi_square_against_the_stated_noise() -> None:
     suspicious, impossible = float(chdtri(10, 1e-3)), float(chdtri(10, 1e-9))
-    only(consistency(1e6, 0), NOTHING)
-    only(consistency(2.0 * float(chdtri(1, 1e-3)), 1), WARNING)
-    only(consistency(suspicious - 0.1, 10), NOTHING)
-    only(consistency(suspicious + 0.1, 10), WARNING, "(chi square 30 for 10 degrees of freedom)")
-    only(consistency(impossible - 0.1, 10), WARNING)
-    only(consistency(impossible + 0.1, 10), REFUSED)
+    assert_only(consistency(1e6, 0), NOTHING)
+    assert_only(consistency(2.0 * float(chdtri(1, 1e-3)), 1), WARNING)
+    assert_only(consistency(suspicious - 0.1, 10), NOTHING)
+    assert_only(consistency(suspicious + 0.1, 10), WARNING, "(chi square 30 for 10 degrees of freedom)")
+    assert_only(consistency(impossible - 0.1, 10), WARNING)
+    assert_only(consistency(impossible + 0.1, 10), REFUSED)
 
 
 def test_a_variable_of_the_session_outside_its_prior() -> None:
@@ -225,8 +227,8 @@ def test_a_variable_of_the_session_outside_its_prior() -> None:
 
 
 def test_samples_of_the_posterior() -> None:
-    only(sampling(60.0), NOTHING)
-    only(sampling(59.4), WARNING, "(worth 59 independent samples, 60 needed)")
+    assert_only(sampling(60.0), NOTHING)
+    assert_only(sampling(59.4), WARNING, "(worth 59 independent samples, 60 needed)")
 
 
 def tre(worst_mm: float, systematic_mm: float | None = None) -> PredictedTre:
@@ -235,10 +237,10 @@ def tre(worst_mm: float, systematic_mm: float | None = None) -> PredictedTre:
 
 
 def test_predicted_error_against_the_limit() -> None:
-    only(accuracy(tre(3.0), CONFIG), NOTHING)
-    only(accuracy(tre(3.01), CONFIG), WARNING, "is 3.0 mm (95 % bound), the limit 3.0 mm: take more pairs")
-    only(accuracy(tre(6.0), CONFIG), WARNING)
-    only(accuracy(tre(6.01), CONFIG), REFUSED)
+    assert_only(accuracy(tre(3.0), CONFIG), NOTHING)
+    assert_only(accuracy(tre(3.01), CONFIG), WARNING, "is 3.0 mm (95 % bound), the limit 3.0 mm: take more pairs")
+    assert_only(accuracy(tre(6.0), CONFIG), WARNING)
+    assert_only(accuracy(tre(6.01), CONFIG), REFUSED)
     assert accuracy(tre(6.01), CONFIG)[0].is_error
 
 
@@ -289,24 +291,24 @@ def test_shares_of_the_beam_and_the_edge_in_the_error_at_the_worst_target() -> N
 
 
 def test_spots_behind_the_beams_origin() -> None:
-    only(beam_sides(np.array([0.0, 1.0])), NOTHING)
-    only(beam_sides(np.array([-0.1, 0.0, 30.0])), WARNING, "1 of 3 spots lie behind")
+    assert_only(beam_sides(np.array([0.0, 1.0])), NOTHING)
+    assert_only(beam_sides(np.array([-0.1, 0.0, 30.0])), WARNING, "1 of 3 spots lie behind")
 
 
 def test_second_minima_and_too_few_pairs() -> None:
     def of(found: EpochSearch, pairs: int, is_open: bool = False, has_initial: bool = False) -> list[Condition]:
         return ambiguity(found, pairs, is_open=is_open, has_initial=has_initial, config=CONFIG)
 
-    only(of(search(10.0, 14.0), 6), NOTHING)
-    only(of(search(10.0), 6, is_open=True), NOTHING)
-    only(of(search(), 6, is_open=True), REFUSED, "starts from an ambiguous registration")
-    only(
+    assert_only(of(search(10.0, 14.0), 6), NOTHING)
+    assert_only(of(search(10.0), 6, is_open=True), NOTHING)
+    assert_only(of(search(), 6, is_open=True), REFUSED, "starts from an ambiguous registration")
+    assert_only(
         of(search(10.0, 14.0), 6, is_open=True),
         REFUSED,
         "the 6 pairs (chi square 10.0 and 14.0, 4.0 apart, 9.2 needed)",
     )
-    only(of(search(10.0), 4), REFUSED, "4 pairs leave the registration open (6 needed", "take 2 more")
-    only(of(search(10.0), 4, has_initial=True), NOTHING)
+    assert_only(of(search(10.0), 4), REFUSED, "4 pairs leave the registration open (6 needed", "take 2 more")
+    assert_only(of(search(10.0), 4, has_initial=True), NOTHING)
 
 
 AWAY = "the beams run away from the probe"
@@ -333,19 +335,19 @@ MIRRORED = "the mirrored hypothesis fits better"
     ],
 )
 def test_the_mirrored_hypothesis(found: EpochSearch, verdict: Verdict | None, says: str) -> None:
-    only(ambiguity(found, 9, is_open=False, has_initial=False, config=CONFIG), verdict, says)
+    assert_only(ambiguity(found, 9, is_open=False, has_initial=False, config=CONFIG), verdict, says)
 
 
 def test_reversed_sweeps_and_another_beam() -> None:
     beam = 100.0 - float(chdtri(4, 1e-9))
-    only(hypotheses(search(other_way_cost=1.0), CONFIG), NOTHING)
-    only(hypotheses(search(100.0, 200.0, other_way_cost=81.7, own_beam_cost=beam + 0.1), CONFIG), NOTHING)
-    only(
+    assert_only(hypotheses(search(other_way_cost=1.0), CONFIG), NOTHING)
+    assert_only(hypotheses(search(100.0, 200.0, other_way_cost=81.7, own_beam_cost=beam + 0.1), CONFIG), NOTHING)
+    assert_only(
         hypotheses(search(100.0, other_way_cost=81.5), CONFIG),
         REFUSED,
         "signs reversed (chi square 81.5 against 100.0)",
     )
-    only(hypotheses(search(100.0, own_beam_cost=beam - 0.1), CONFIG), REFUSED, "another beam than the aims")
+    assert_only(hypotheses(search(100.0, own_beam_cost=beam - 0.1), CONFIG), REFUSED, "another beam than the aims")
 
 
 def test_reasons_stand_in_the_order_to_look_at_them() -> None:

@@ -35,7 +35,7 @@ class TagCorners:
         self._at: dict[tuple[int, int], tuple[FloatArray, int]] = {}  # place at rest, and of how many frames it is
 
     def begin_again(self) -> None:
-        """Learn the place at rest anew, from the frames to come."""
+        """Learn the place at rest again, from the frames to come."""
         self._at.clear()
 
     def at_rest(self, views: Sequence[Mapping[int, FloatArray]]) -> bool | None:

@@ -138,11 +138,10 @@ class LiveLoop:
         self._aims = AimTaker(
             model, self.marker_tracker, self.pulse_locator.locator, self._tell, recorder.hand_over, self._t
         )
-        self._text, self._task, self._number = "", "", 0
+        self._text, self._task, self._number, self._unshown = "", "", 0, 0
         self._pace = Pace(self._began_s)
         self._unused = 0  # frames that were older than another, or repeated
         self._bmode: BmodeFrame | None = None
-        self._unshown = 0
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._sent = False  # whether the sinks have got anything
         self._snapshot: Snapshot | None = None
