@@ -249,8 +249,13 @@ class Rehearsal:
                 self.latched = ""
             case TakeAim():
                 self._aim()
-            case TakeMove() | TakePoint():
-                raise AssertionError("no one reported a move")
+            case TakeMove():
+                if self._tags is None or not self._tags.take_report(self.now_s):
+                    self.engine.add(CameraMoved(self.now_s))
+                    if self._tags is not None:
+                        self._tags.begin_again()
+            case TakePoint():
+                raise AssertionError("no one measured a point")
             case TakePairs(pm, looks):
                 spot = one_spot(looks)
                 for look in spot.looks:

@@ -224,6 +224,38 @@ def test_a_frame_from_before_a_reported_move_is_no_reference_of_the_new_epoch(
     assert pictures.tags.moving_since_s is None
 
 
+def test_a_reported_move_is_measured_by_tags_in_view(pictures: Pictures) -> None:
+    assert not pictures.tags.take_report(0.0), "nothing is known of the tags yet"
+    pictures.frames(20)
+    rested_s = pictures.now_s
+    pictures.bump()
+    assert pictures.tags.take_report(pictures.now_s)
+    assert pictures.tags.moving_since_s == rested_s, "at once"
+    move = pictures.frames(8)
+    assert move is not None
+    assert move.since_s == rested_s
+    assert move.camera_new_T_camera_old is not None
+    np.testing.assert_allclose(move.camera_new_T_camera_old, BUMP, atol=0.5)
+    assert pictures.frames(30) is None
+
+
+def test_a_reported_move_that_the_tags_do_not_show_starts_the_registration_again(pictures: Pictures) -> None:
+    pictures.frames(20)
+    assert pictures.tags.take_report(pictures.now_s)
+    move = pictures.frames(8)
+    assert move is not None
+    assert move.camera_new_T_camera_old is None
+    assert any("show no camera move" in text for text in pictures.told)
+    assert pictures.tags.moving_since_s is None
+    assert pictures.frames(30) is None
+
+
+def test_a_reported_move_out_of_the_tags_view_is_not_measured(pictures: Pictures) -> None:
+    pictures.frames(20)
+    assert not pictures.tags.take_report(pictures.now_s + UNSEEN_S + 1.0)
+    assert pictures.tags.moving_since_s is None
+
+
 def test_a_camera_that_comes_back_has_not_moved(pictures: Pictures) -> None:
     pictures.frames(20)
     pictures.bump()

@@ -24,7 +24,7 @@ from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.drivers.simulated import RoomProcess, ask_truth
 from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray
-from fgreg.live.actions import Action, Follow, TakeMove
+from fgreg.live.actions import Action, Follow
 from fgreg.live.launch import running
 from fgreg.live.simulated_room import room_setup
 from fgreg.live.stage_commands import AGAIN_RAD, AGAIN_S
@@ -34,7 +34,6 @@ from fgreg.model.hindrances import TOO_SLOW
 from fgreg.model.session_model import StageModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.room import Room, room_config
 from fgreg.stage.limits import MotionLimits
@@ -174,9 +173,6 @@ class _Watched(Rehearsal):
             self.figures.refused.append(str(error))
 
     def _do(self, action: Action) -> None:
-        if isinstance(action, TakeMove):
-            self.engine.add(CameraMoved(self.now_s))
-            return
         if isinstance(action, Follow) and action.sigma_rad <= SIGMA_RAD:
             goal, at_s = self._order
             if not (abs(action.scan_rad - goal) < AGAIN_RAD and self.now_s - at_s < AGAIN_S):

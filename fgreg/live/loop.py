@@ -387,8 +387,8 @@ class LiveLoop:
             case TakeChoice(pm, include, by):
                 self._choose(pm, by, include=include)
             case TakeMove():
-                if self._static_tags.moving_since_s is not None:
-                    self._news(Tell("the static tags show the move already: it is recorded once the camera rests"))
+                if self._static_tags.take_report(host_now()):
+                    self._news(Tell("the static tags measure the move: it is recorded once the camera rests"))
                     return
                 self._static_tags.begin_again()
                 self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))

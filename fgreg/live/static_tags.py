@@ -64,6 +64,7 @@ SHIFTED_FRAMES = 2
 BACK_SHARE = 0.5
 """Share of the least move below which the camera is back where it was; a holder that drifts is not."""
 BACK = "the camera is back where it was, by the static tags"
+NOT_SEEN = "the static tags show no camera move: as one was reported, the registration starts again"
 UNSTEADY, APART = 12, 6
 """Frames after which a tag without a steady pose, or one that goes its own way, is no longer used."""
 
@@ -108,6 +109,7 @@ class StaticTags:
         self._shifted: list[float] = []  # host times of frames since then with the tags elsewhere
         self._fitted = 0  # number of those whose poses are known
         self._alarm_since_s: float | None = None
+        self._reported = False  # that move, by the operator
         self._unseen = False  # no tag is in view, and the operator was told
         self.frames = 0
         self.next_s = -np.inf
@@ -138,11 +140,23 @@ class StaticTags:
 
     def begin_again(self) -> None:
         """The camera has moved, as others tell: where the tags are is learnt again, from the frames to come."""
-        self._monitor, self._alarm_since_s = TagMonitor(), None
+        self._monitor, self._alarm_since_s, self._reported = TagMonitor(), None, False
         self._job, self._newest = None, self._given
         self._learn_corners()
         self._apart.clear()
         self._disagree = 0
+
+    def take_report(self, now_s: float) -> bool:
+        """The operator reports a camera move: whether the tags measure it, for :meth:`step` to return at the rest."""
+        if self.moving_since_s is not None:
+            return True
+        if now_s - self._seen_s > UNSEEN_S or not self._monitor.detector.means:
+            return False
+        self._alarm_since_s, self._unrest_s = self._shifted[0] if self._shifted else self._rest_s, now_s
+        self._monitor, self._reported = TagMonitor(before=self._monitor.detector.means), True
+        self._job, self._newest, self.next_s = None, self._given, now_s
+        self._learn_corners()
+        return True
 
     def step(self, whole: WholeFrame | None, now_s: float, *, with_board: bool) -> HolderMove | None:
         """Take in the newest frame that was searched as a whole; the move that has just ended, or None.
@@ -268,13 +282,15 @@ class StaticTags:
 
     def _at_rest(self, found: TagsAtRest) -> HolderMove | None:
         since_s, self._alarm_since_s = self._alarm_since_s, None
+        reported, self._reported = self._reported, False
         motion = found.camera_new_T_camera_old
         shift_mm = view_shift_mm(motion)
         if since_s is None:
             raise AssertionError("a rest without a move")
         if shift_mm < BACK_SHARE * SETTINGS.least_mm:
-            self._news.append(BACK)
-            return None
+            self._news.append(NOT_SEEN if reported else BACK)
+            # The operator's word stands: what has moved may be something else than the camera against these tags.
+            return HolderMove(since_s, None, None) if reported else None
         self._news.append(
             "the static tags show that the camera has moved: "
             f"{shift_mm:.1f} mm and {math.degrees(turn_rad(motion)):.1f} deg"
