@@ -99,9 +99,11 @@ def too_few_text(pms: int, config: SolveConfig) -> str:
     return f"{pms} pairs are too few for a registration: take at least {config.min_pairs}"
 
 
-def joint_start(measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int]) -> SharedState:
-    """One state with all solvable epochs: each from its own minimum, else from another one by the measured motions."""
-    transforms = {k: minimum.state.trus_T_camera()[0] for k, minimum in chosen.items()}
+def _with_motions(
+    measurements: Measurements, known: Mapping[int, FloatArray], solvable: Sequence[int]
+) -> dict[int, FloatArray]:
+    """trus_T_camera (4, 4) of all solvable epochs: those known, and where measured motions lead from them."""
+    transforms = dict(known)
     while len(transforms) < len(solvable):
         for k in solvable:
             epoch = measurements.epochs[k]
@@ -113,6 +115,12 @@ def joint_start(measurements: Measurements, chosen: dict[int, Minimum], solvable
                 transforms[k] = transforms[old] @ inverse(motion)
             elif k in transforms and old in solvable and old not in transforms:
                 transforms[old] = transforms[k] @ motion
+    return transforms
+
+
+def joint_start(measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int]) -> SharedState:
+    """One state with all solvable epochs: each from its own minimum, else from another one by the measured motions."""
+    transforms = _with_motions(measurements, {k: m.state.trus_T_camera()[0] for k, m in chosen.items()}, solvable)
     most = max(chosen, key=lambda k: sum(pair.epoch == k for pair in measurements.pairs))
     beam = chosen[most].state
     # A chart about the beam found: its direction is the nominal z, far from the chart's edge.
@@ -207,11 +215,19 @@ def _open_minima(
         if not search.clean:
             continue
         rivals = [m for m in search.minima if m.cost - search.minima[0].cost < config.second_minimum_chi2]
-        poses = [start.trus_T_camera(place)[0], *(rival.state.trus_T_camera()[0] for rival in rivals)]
-        many = start.take(np.zeros(len(poses), dtype=np.int64))
-        rotation, translation = many.rotation.copy(), many.translation_mm.copy()
-        rotation[:, place] = [pose[:3, :3] for pose in poses]
-        translation[:, place] = [pose[:3, 3] for pose in poses]
+        now = np.stack([start.trus_T_camera(i)[0] for i in range(len(solvable))])
+        poses = [now]
+        chain = next(chain for chain in epoch_chains(measurements, solvable) if epoch in chain)
+        apart = {k: now[i] for i, k in enumerate(solvable) if k not in chain}
+        for rival in rivals:
+            pose = rival.state.trus_T_camera()[0]
+            poses.append(now.copy())
+            poses[-1][place] = pose
+            if len(chain) > 1:  # epochs that motions tie to this one would hold it back where it was
+                led = _with_motions(measurements, {**apart, epoch: pose}, solvable)
+                poses.append(np.stack([led[k] for k in solvable]))
+        many, there = start.take(np.zeros(len(poses), dtype=np.int64)), np.stack(poses)
+        rotation, translation = there[:, :, :3, :3], there[:, :, :3, 3]
         found = optimize(problem, replace(many, rotation=rotation, translation_mm=translation), max_iterations=30)
         cost = np.where(np.isfinite(found.evaluation.cost), found.evaluation.cost, np.inf)
         if not np.isfinite(cost.min()):
