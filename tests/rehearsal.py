@@ -219,7 +219,7 @@ class Rehearsal:
     def _follow_camera(self, tags: StaticTags) -> None:
         """What the static tags show of the camera, in the frames that are searched as a whole."""
         self._frames += 1
-        whole = self._seen.whole(self.now_s) if self._frames % EVERYWHERE == 0 else None
+        whole = self._seen.whole(self.now_s) if self._frames % EVERYWHERE == 0 or tags.in_doubt else None
         move = tags.step(whole, self.now_s, with_board=False)
         self.messages += [(self.now_s, Tell(text)) for text in tags.news()]
         if move is not None:

@@ -132,6 +132,7 @@ def test_the_marker_is_followed_as_far_as_a_frame_shows_the_tags_in_their_place(
     pictures.frames(1)
     assert pictures.tags.still_until_s() == rested_s
     assert pictures.tags.moving_since_s is None, "one frame may be wrong"
+    assert pictures.tags.in_doubt, "another one is searched at once"
     pictures.bump(inverse(BUMP))
     pictures.frames(1)
     assert pictures.tags.still_until_s() == pictures.now_s

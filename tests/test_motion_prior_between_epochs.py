@@ -23,6 +23,7 @@ from fgreg.online.events import CameraMoved, events_in_order
 from fgreg.registration.joint_solve import solve_jointly
 from fgreg.registration.register import pack_session, register, register_near
 from fgreg.registration.solve import distance_to_explicit, solve
+from fgreg.registration.verdict import mirrored
 from tests.forward import MOTION_SIGMA, make_measurements, random_marker_T_laser, random_trus_T_camera
 from tests.online_streams import batch, events, first, restored, run, sigmas_apart, unreported_move
 
@@ -254,3 +255,25 @@ def test_an_ambiguous_epoch_takes_the_epochs_tied_to_it_along_to_each_of_its_min
     near = register_near(measurements, model, CONFIG, start, range(3))
     least = near.optimum.evaluation.cost[0]
     assert found.ambiguous or found.optimum.evaluation.cost[0] < least + 0.1
+
+
+@pytest.mark.parametrize("seed", [8, 22])
+def test_an_epoch_of_three_pms_is_not_called_mirrored_for_a_minimum_that_others_exclude(seed: int) -> None:
+    """Of 40 such sessions 19 were, where the first of its equally good minima has beams from the probe's side."""
+    model, whole, _ = make_measurements(
+        np.random.default_rng(seed), aims=6, pairs=9, epochs=2, known_motion=True, looks_per_pm=2, share_marker=True,
+        look_spacing_deg=2.0, first_hit=False, spread_deg=10.0,
+    )  # fmt: skip
+    left: list[int] = []
+    for epoch, count in enumerate((4, 3)):
+        left += list(dict.fromkeys(pair.pm for pair in whole.pairs if pair.epoch == epoch))[:count]
+    tied = replace(whole, pairs=tuple(pair for pair in whole.pairs if pair.pm in left))
+
+    def says_mirrored(measurements: Measurements) -> list[bool]:
+        found = register(measurements, model, CONFIG)
+        return [bool(mirrored(search, CONFIG)) for search in found.searches]
+
+    assert says_mirrored(tied) == [False, False]
+    looks = [replace(pair.look, scan_rad=-pair.look.scan_rad, sweep=-pair.look.sweep) for pair in tied.pairs]
+    other_way = [replace(pair, look=look) for pair, look in zip(tied.pairs, looks, strict=True)]
+    assert any(says_mirrored(replace(tied, pairs=tuple(other_way)))), "a stage that turns the other way is still told"

@@ -203,13 +203,16 @@ def conducted(
 ) -> Figures:
     """A room in real time, as by ``fgreg live --no-viewer``."""
     figures = Figures(seed)
-    samples: list[tuple[float, OnlineEstimate, bool]] = []
+    samples: list[
+        tuple[float, OnlineEstimate, bool, bool]
+    ] = []  # of its time: whether it is new, whether a second passed
     orders: list[tuple[float, float, float]] = []
     config = room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s, static_tags=tags)
     with ExitStack() as stack:
         room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s, static_tags=tags))
         with running(room_setup(room.path, config), folder, SolveConfig()) as session:
-            began, sampled, last = time.monotonic(), -math.inf, None
+            began, sampled = time.monotonic(), -math.inf
+            last: tuple[float, ...] = ()
             loop, give = session.loop, session.loop._steering.order
 
             def order(action: Any) -> bool:
@@ -227,9 +230,11 @@ def conducted(
                 if estimate is not None and status.verdict is Verdict.OK and estimate.predicted_tre is not None:
                     if math.isnan(figures.first_ok_s):
                         figures.first_ok_s, figures.spots = now - began, session_pms()
-                    if estimate is not last or now - sampled > SAMPLE_S:
-                        samples.append((now, estimate, estimate is not last))
-                        sampled, last = now, estimate
+                    said = estimate.t, estimate.epoch, estimate.pairs, estimate.predicted_tre.worst_mm
+                    sample = now - sampled > SAMPLE_S
+                    if said != last or sample:
+                        samples.append((now, estimate, said != last, sample))
+                        sampled, last = now if sample else sampled, said
                 return now - began < seconds and not (first and math.isfinite(figures.first_ok_s))
 
             def session_pms() -> int:
@@ -241,15 +246,15 @@ def conducted(
             used = loop.figures
             p50, p99 = np.percentile(np.array(used.latency_ms or [math.nan]), (50, 99))
             print(f"  {used.frames} frames, {used.skipped} skipped; latency p50 {p50:.0f}, p99 {p99:.0f} ms")
-        truth = ask_truth(room.path, [t for t, _, _ in samples], [t for t, _, _ in orders])
+        truth = ask_truth(room.path, [t for t, *_ in samples], [t for t, _, _ in orders])
     targets = read_session(folder).model.targets_mm
-    for (_, estimate, new), true in zip(samples, truth["trus_T_camera"], strict=True):
+    for (_, estimate, new, sample), true in zip(samples, truth["trus_T_camera"], strict=True):
         assert estimate.predicted_tre is not None
         found, bound = error_mm(estimate, np.array(true), targets), estimate.predicted_tre.worst_mm
         if new:
             figures.oks.append((found, bound))
-        figures.seconds_ok += 1
-        figures.seconds_wrong += found > 2.0 * bound
+        figures.seconds_ok += sample
+        figures.seconds_wrong += sample and found > 2.0 * bound
     for (_, scan, sigma), spot in zip(orders, truth["spots_mm"], strict=True):
         figures.orders_sigma.append((scan - float(config.scene.array.plane_angle_rad(np.array(spot)))) / sigma)
     commands = set()

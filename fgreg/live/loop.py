@@ -279,6 +279,8 @@ class LiveLoop:
             self._by_holder += [] if move is None else [move]
         aiming = self._workflow.stage is Stage.AIMING
         move = self._static_tags.step(self.marker_tracker.whole, now, with_board=not aiming)
+        if self._static_tags.in_doubt:
+            self.marker_tracker.search_whole()
         if move is not None:  # of two in a row the second one alone is not the motion
             self._by_tags = move if self._by_tags is None else HolderMove(self._by_tags.since_s, None, None)
         for text in self._static_tags.news():

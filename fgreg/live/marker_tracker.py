@@ -21,7 +21,7 @@ from fgreg.model.time_sync import DeviceClock, PoseHistory, TimedPose
 
 POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled again after every ``POOL_EVERY`` detections, over the last ``POOL_OVER``."""
-WHOLE_S = 1.0
+WHOLE_S = 0.5
 """Where there are static tags, a whole image is searched at least this often: the stage waits for what it shows."""
 LEAVES = 1.25
 """The next frame begins no sooner than this many times what the last one took: on a slow machine the registration and
@@ -99,6 +99,10 @@ class MarkerTracker:
         self.poses.clear()
         self._from_s = now_s
 
+    def search_whole(self) -> None:
+        """The next frame is searched as a whole."""
+        self._whole_s = -math.inf
+
     def _begin(self) -> None:
         """Hand the waiting frame to the workers, if they are free."""
         frame, now_s = self._waiting, host_now()
@@ -109,7 +113,7 @@ class MarkerTracker:
         ready = [worker.ready(picture) for worker, picture in zip(self._workers, pictures, strict=False)]
         if not all(ready):
             return
-        self._searches_whole = self._begun % EVERYWHERE == 0 or now_s - self._whole_s > self._whole_every_s
+        self._searches_whole = self._begun % EVERYWHERE == 0 or now_s - self._whole_s >= self._whole_every_s
         self._whole_s = now_s if self._searches_whole else self._whole_s
         for worker, picture in zip(self._workers, pictures, strict=False):
             worker.submit(picture, whole=self._searches_whole)  # both views at once

@@ -126,6 +126,11 @@ class StaticTags:
             return self._alarm_since_s
         return self._shifted[0] if len(self._shifted) >= SHIFTED_FRAMES else None
 
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the last frame alone shows the tags out of their place, so that another one is wanted at once."""
+        return 0 < len(self._shifted) < SHIFTED_FRAMES
+
     def still_until_s(self) -> float:
         """Host time of the newest frame that shows the tags in their place; infinite where none is known yet.
 

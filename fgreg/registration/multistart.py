@@ -67,7 +67,7 @@ class EpochSearch:
         minima: best first, with the chi square of the inliers.
         mirrored_cost: best cost of the mirrored hypothesis.
         mirrored_outside_cost: best cost of its minima whose beams come from outside the probe; None without any.
-        outside: whether the beams of the first minimum come from outside the probe.
+        outside: whether the beams come from outside the probe, at the first minimum; of a registration at its optimum.
         other_way_cost: best cost with the sign of every sweep reversed; None where every shot fits (not tried).
         own_beam_cost: best cost with a beam from the pairs alone, without the aims; None where not tried.
         clean: whether every shot fits.
@@ -251,16 +251,17 @@ def _least(cost: FloatArray, among: BoolArray) -> float | None:
     return float(cost[among].min()) if among.any() else None
 
 
-def from_outside(problem: PackedProblem, state: SharedState) -> BoolArray:
-    """(S,) whether most beams of a one-epoch problem point towards the probe, as they do with the fibre outside.
+def from_outside(problem: PackedProblem, state: SharedState, epoch: int = 0) -> BoolArray:
+    """(S,) whether most beams of an epoch point towards the probe, as they do with the fibre outside.
 
     PMs on a nearly flat surface fit their mirror image as well. The beams then come from behind the surface, where the
     probe is.
     """
-    points = arc_points(problem, np.zeros(1))[0]
+    of = problem.beam_epoch[problem.look_beam] == epoch
+    points = arc_points(problem, np.zeros(1))[0][of]
     radial = points[:, 1:] / np.linalg.norm(points[:, 1:], axis=1, keepdims=True)
     camera_d = np.einsum("bij,sj->sbi", problem.beams.rotation, state.beam_direction())
-    trus_d = np.einsum("sij,sbj->sbi", state.rotation[:, 0], camera_d)[:, problem.look_beam]
+    trus_d = np.einsum("sij,sbj->sbi", state.rotation[:, epoch], camera_d)[:, problem.look_beam[of]]
     return np.asarray(np.mean(np.sum(trus_d[..., 1:] * radial, axis=-1), axis=1) < 0.0)
 
 

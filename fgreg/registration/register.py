@@ -38,6 +38,7 @@ from fgreg.registration.multistart import (
     Minimum,
     calibrate_beam,
     choose_minimum,
+    from_outside,
     search_epoch,
     targets_moved,
 )
@@ -379,6 +380,9 @@ def _registration(
     covariance = inverse_hessian(optimum.evaluation.hessian[0])
     if covariance is None:
         raise EstimationError("these shots leave the registration undetermined; take more pairs")
+    # Three PMs fit several minima exactly, and other epochs tell which: it need not be the first of the search.
+    sides = {k: from_outside(problem, optimum.state, place) for place, k in enumerate(epochs) if searches[k].minima}
+    searches = tuple(replace(of, outside=bool(sides[k][0])) if k in sides else of for k, of in enumerate(searches))
     return Registration(
         model=model,
         measurements=kept,
