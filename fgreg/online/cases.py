@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fgreg.camera_moves.detector import MIN_KNOWN, MoveCase
 from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS
 from fgreg.graph.columns import Columns
 from fgreg.graph.shared_state import Quadratic, gaussian_prior
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import Measurements
+from fgreg.registration.epoch_verdicts import EpochReport
+from fgreg.registration.epochs import FinishedEpochs, epoch_chains, has_registration
 from fgreg.registration.multistart import EpochSearch, Minimum
 from fgreg.smoother.state import State, looks_by_pm
 from fgreg.smoother.updates import FIRST_PAIRS
@@ -55,6 +61,25 @@ def move_case(state: State, columns: Columns) -> MoveCase:
         known=state.carried.at(active.state, columns) if active and state.carried and sound else None,
         earlier=_earlier(state, state.epoch) if state.epoch_pairs <= MOST_LOOKS else {},
     )
+
+
+def finished_epochs(state: State, prior: Quadratic, reports: Sequence[EpochReport]) -> FinishedEpochs | None:
+    """The earlier epochs as the prior of the current one; None where a tied one of them misses a condition.
+
+    ``reports``: of the first epochs, as the full solve judged them.
+    """
+    if has_registration(prior) and not _tied_are_ok(state, reports):
+        return None
+    old = state.epochs[state.now.start.old(state.epoch)]
+    return FinishedEpochs(prior, is_open=old.is_open and has_registration(prior))
+
+
+def _tied_are_ok(state: State, reports: Sequence[EpochReport]) -> bool:
+    """Whether no epoch that measured motions tie to the current one misses a condition that both have to meet."""
+    starts = tuple(epoch.start for epoch in state.epochs)
+    known = [k for k, epoch in enumerate(state.epochs) if epoch.state is not None or k == state.epoch]
+    tied = next(chain for chain in epoch_chains(Measurements((), (), starts), known) if state.epoch in chain)
+    return all(r.own_verdict is Verdict.OK for r in reports if r.estimate.index in tied[:-1])
 
 
 def _earlier(state: State, to: int) -> dict[int, Quadratic]:

@@ -29,16 +29,18 @@ from fgreg.model.measurements import Aim, EpochStart, KnownPoint, Measurements, 
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
-from fgreg.online.cases import FIRST_PMS, LEAST_PMS, is_due, known_minima, move_case
+from fgreg.online.cases import FIRST_PMS, LEAST_PMS, finished_epochs, is_due, known_minima, move_case
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.event_checks import check
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, other_start, result_of
+from fgreg.online.next_state import next_state
+from fgreg.online.noticed_moves import NoticedMoves
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
 from fgreg.registration.epoch_verdicts import EpochReport
-from fgreg.registration.epochs import FinishedEpochs, epoch_chains, has_registration, last_epoch
+from fgreg.registration.epochs import FinishedEpochs, last_epoch
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.solve import Solution, solve
 from fgreg.smoother.initialise import initialised
@@ -48,11 +50,8 @@ from fgreg.smoother.state import Epoch, State, finished_prior, make_setting
 from fgreg.smoother.updates import (
     FIRST_PAIRS,
     finished_prior_at_start,
-    with_aim,
     with_motion,
     with_move,
-    with_pair,
-    with_point,
     without_move,
 )
 from fgreg.tracking.query import track
@@ -113,9 +112,7 @@ class OnlineRegistration:
         self._failures = ("", "")  # as reported in the estimate
         self._losses = 0  # cases lost in a row
         self._tags = TagMonitor()
-        self._moves: list[DetectedMove] = []
-        self._loop_closures: list[DetectedLoopClosure] = []
-        self._noticed: dict[int, str] = {}
+        self._noticed = NoticedMoves()
         self._solver = make_solver(full_solve, model, self._config, verdicts=verdicts)
         self._estimate = self._estimated(self._state, 0.0)
 
@@ -145,7 +142,8 @@ class OnlineRegistration:
         before = self._state
         try:
             tags, found = self._seen(event)
-            state = self._next(event, found)
+            noticed = before.epoch in self._noticed.texts
+            state = next_state(before, event, found, self._setting, noticed=noticed, restoring=self._restoring)
             estimate = self._estimated(state, event.t)
             misplaced = self._misplaced if self._restoring else self._misplaced_now(state, event)
         except EventRefused:
@@ -164,7 +162,7 @@ class OnlineRegistration:
         elif isinstance(event, CameraMoved) and event.detected and event.since_t is not None:
             self._note_move(before, state.now.first, event.since_t, event.t, None, recorded=True)
         elif isinstance(event, LoopClosed):
-            self._loop_closures.append(DetectedLoopClosure(event.epoch, event.to, event.t, None))
+            self._noticed.loop_closures.append(DetectedLoopClosure(event.epoch, event.to, event.t, None))
         self._want(event, found, misplaced)
         self._solve(event.t)
         if isinstance(event, Pair) and state is not self._state and self._state.shots:
@@ -177,39 +175,6 @@ class OnlineRegistration:
         if not (isinstance(event, StaticTags) and self._find_moves):
             return self._tags, None
         return monitored(self._tags, event.t, TagFrame(event.camera_T_tag, event.covariance), TagSettings())
-
-    def _next(self, event: OnlineEvent, found: TagsMoved | TagsAtRest | None) -> State:
-        state, setting = self._state, self._setting
-        if isinstance(event, Pair):
-            return with_pair(state, event, setting)
-        if isinstance(event, Aim):
-            return with_aim(state, event, setting)
-        if isinstance(event, KnownPoint):
-            return with_point(state, event, setting)
-        if isinstance(event, CameraMoved):
-            start = EpochStart(event.t, event.camera_new_T_camera_old, event.covariance)
-            if event.since_t is not None:
-                last, since_t = self._pairs_since(event.since_t), event.since_t
-                return with_move(state, replace(start, t=since_t), setting, last, since_t)
-            if self._noticed.get(state.epoch) and state.epoch_pms < LEAST_PMS:
-                # This may be the move that was detected, or another one, so the measured motion cannot be used.
-                start = EpochStart(event.t)
-            return with_move(state, start, setting)
-        if isinstance(found, TagsMoved):
-            last = self._pairs_since(found.since_t)
-            return with_move(state, EpochStart(found.since_t), setting, last, found.since_t)
-        if isinstance(found, TagsAtRest):
-            start = EpochStart(state.now.start.t, found.camera_new_T_camera_old, found.covariance)
-            return with_motion(state, start, setting)
-        if isinstance(event, LoopClosed):
-            if not self._restoring or event.epoch != state.epoch or not event.to < event.epoch:
-                raise EventRefused(f"it closes a loop from epoch {event.epoch} to {event.to} in epoch {state.epoch}")
-            return with_motion(state, back_to(state.now.start, event.to), setting)
-        return replace(state, nis=None, used=False)
-
-    def _pairs_since(self, t: float) -> int:
-        """Number of the epoch's pairs that were taken at ``t`` or later."""
-        return sum(shot.pair.t >= t for shot in self._state.current)
 
     def _misplaced_now(self, state: State, event: OnlineEvent) -> frozenset[int]:
         """PMs of the state that are inliers beyond their limit, or outliers within it; none where no shot was added."""
@@ -289,7 +254,7 @@ class OnlineRegistration:
             self._move_failure = found.move_failure
         if isinstance(found.move, CameraMove):
             before = {shot.label for shot in self._state.shots[self._state.now.first : found.move.first]}
-            if self._start_detected() and len(before) < LEAST_PMS:  # a move of which so few PMs show nothing
+            if self._noticed.by_pairs(self._state) and len(before) < LEAST_PMS:  # they show nothing of a move
                 self._begin_again(found.move.first)
             else:
                 self._reassign(found.move, t)
@@ -315,7 +280,7 @@ class OnlineRegistration:
         finished = self._finished()
         measurements = self._state.measurements()
         if finished is None:
-            known, detected = known_minima(self._state), self._start_detected()
+            known, detected = known_minima(self._state), self._noticed.by_pairs(self._state)
             return FullSolveCase(self._serial, state.epoch, measurements, known, move=move, detected=detected)
         return FullSolveCase(
             self._serial,
@@ -339,20 +304,10 @@ class OnlineRegistration:
             prior = self._finished_prior = self._finished_prior or finished_prior_at_start(state, self._setting)
         except ArithmeticError:
             return None
-        if prior is None or (has_registration(prior) and not self._tied_are_ok()):
-            return None
-        if state.finished is None:
+        found = None if prior is None else finished_epochs(state, prior, self._reports)
+        if found is not None and state.finished is None:
             self._state = replace(state, finished=prior)
-        old = state.epochs[state.now.start.old(state.epoch)]
-        return FinishedEpochs(prior, is_open=old.is_open and has_registration(prior))
-
-    def _tied_are_ok(self) -> bool:
-        """Whether no epoch that measured motions tie to the current one misses a condition that both have to meet."""
-        state, starts = self._state, tuple(epoch.start for epoch in self._state.epochs)
-        known = [k for k, epoch in enumerate(state.epochs) if epoch.state is not None or k == state.epoch]
-        chains = epoch_chains(Measurements((), (), starts), known)
-        tied = next(chain for chain in chains if state.epoch in chain)
-        return all(r.own_verdict is Verdict.OK for r in self._reports if r.estimate.index in tied[:-1])
+        return found
 
     def _take_over(self, found: FullSolveResult) -> None:
         """Take over optimum, inliers and report of a full solve; where that fails the incremental estimate stays."""
@@ -396,17 +351,10 @@ class OnlineRegistration:
         self._solve_wanted = True
         self._note_move(before, found.first, since_t, t, found.log_bayes)
 
-    def _start_detected(self) -> bool:
-        """Whether the current epoch began with a move that pairs showed (or a recorded one, where that is unknown)."""
-        state = self._state
-        mine = next((move for move in self._moves if move.since == state.now.first), None)
-        by_tags = mine is not None and mine.log_bayes is None
-        return state.epoch in self._noticed and not by_tags and not state.now.start.motion_known
-
     def _begin_again(self, first: int) -> None:
         """The current epoch, which began with a move that was detected, begins with another pair."""
-        state, old = self._state, self._state.now.first
-        known = next((move for move in self._moves if move.since == old), None)
+        state = self._state
+        known = self._noticed.begun_by(state)
         before = without_move(state)
         since_t = state.shots[first].pair.t
         self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - first, since_t)
@@ -414,7 +362,7 @@ class OnlineRegistration:
         self._divided()
         self._solve_wanted = True
         if known is not None:
-            self._moves.remove(known)
+            self._noticed.moves.remove(known)
         t, log_bayes = (self._t, None) if known is None else (known.alarm_t, known.log_bayes)
         self._note_move(before, first, since_t, t, log_bayes, recorded=known is None)
 
@@ -429,7 +377,7 @@ class OnlineRegistration:
         except Exception:  # the epoch stays as it was, only its registration is less certain
             self._report = report
             return
-        self._loop_closures.append(DetectedLoopClosure(before.epoch, found.to, t, found.log_bayes))
+        self._noticed.loop_closures.append(DetectedLoopClosure(before.epoch, found.to, t, found.log_bayes))
         self._state, self._estimate = state, estimate
         self._serial += 1
         self._division += 1
@@ -438,12 +386,8 @@ class OnlineRegistration:
     def _note_move(
         self, before: State, first: int, since_t: float, t: float, log_bayes: float | None, *, recorded: bool = False
     ) -> None:
-        """Note a move that was detected, now or (``recorded``) when the session was recorded."""
-        last_t = before.shots[first - 1].pair.t if first else before.now.start.t
-        move = DetectedMove(before.epoch - len(self._moves), first, since_t, last_t, t, log_bayes)
-        if not recorded:
-            self._moves.append(move)
-        self._noticed[self._state.epoch] = move.text
+        """Note a move that was detected, and report it; arguments as of :meth:`NoticedMoves.add`."""
+        self._noticed.add(before, self._state.epoch, first, since_t, t, log_bayes, recorded=recorded)
         self._estimate = self._estimated(self._state, self._estimate.t)
 
     @contextmanager
@@ -472,7 +416,7 @@ class OnlineRegistration:
     def _solve_all(self) -> None:
         """Run the full solve of everything in this process."""
         for left in range(MOST_ROUNDS)[::-1]:
-            detected = left > 0 and self._start_detected()
+            detected = left > 0 and self._noticed.by_pairs(self._state)
             case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements(), detected=detected)
             found = full_solve(case, self._model, self._config, verdicts=self._verdicts)
             if found.begins is None:
@@ -496,12 +440,12 @@ class OnlineRegistration:
     @property
     def moves(self) -> tuple[DetectedMove, ...]:
         """Detected camera moves in the order of time; their epochs are numbered as reported."""
-        return tuple(self._moves)
+        return tuple(self._noticed.moves)
 
     @property
     def loop_closures(self) -> tuple[DetectedLoopClosure, ...]:
         """Loop closures in the order of time."""
-        return tuple(self._loop_closures)
+        return tuple(self._noticed.loop_closures)
 
     @property
     def state(self) -> State:
@@ -535,7 +479,7 @@ class OnlineRegistration:
         for left in range(MOST_ROUNDS)[::-1]:
             measurements = self.measurements()
             solution = solve(measurements, [], self._model, self._config)
-            detected = left > 0 and self._start_detected()
+            detected = left > 0 and self._noticed.by_pairs(self._state)
             case = FullSolveCase(self._serial, self._state.epoch, measurements, detected=detected)
             found = solution.registration
             begins = None if found is None else other_start(case, measurements, found, self._config)
@@ -570,7 +514,7 @@ class OnlineRegistration:
         estimate = reported(state, t, report, self._model, self._config, settled=settled)
         # A move whose motion was measured, by static tags or by the holder, is as sure as a reported one.
         measured = state.now.start.motion_known and state.now.start.after is None
-        known = ["" if measured else self._noticed.get(state.epoch, "")]
+        known = ["" if measured else self._noticed.texts.get(state.epoch, "")]
         if self._solver.failure:
             known.append(f"the full solve failed: {self._solver.failure}: its earlier result may be out of date")
         if self._move_failure:
