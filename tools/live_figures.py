@@ -248,9 +248,14 @@ def conducted(
             print(f"  {used.frames} frames, {used.skipped} skipped; latency p50 {p50:.0f}, p99 {p99:.0f} ms")
         truth = ask_truth(room.path, [t for t, *_ in samples], [t for t, _, _ in orders])
     targets = read_session(folder).model.targets_mm
-    for (_, estimate, new, sample), true in zip(samples, truth["trus_T_camera"], strict=True):
+    for (t, estimate, new, sample), true in zip(samples, truth["trus_T_camera"], strict=True):
         assert estimate.predicted_tre is not None
         found, bound = error_mm(estimate, np.array(true), targets), estimate.predicted_tre.worst_mm
+        if found > 2.0 * bound:
+            print(
+                f"  wrong ok after {t - began:.1f} s: {found:.1f} mm, bound {bound:.1f} mm, epoch {estimate.epoch}, "
+                f"{estimate.pairs} pairs, event of {estimate.t:.1f} s"
+            )
         if new:
             figures.oks.append((found, bound))
         figures.seconds_ok += sample
