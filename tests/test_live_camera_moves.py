@@ -195,7 +195,7 @@ class Tags:
     def __init__(self) -> None:
         self.moving_since_s: float | None = None
         self.ended: HolderMove | None = None
-        self.begun_again = 0
+        self.begun_again, self.in_doubt = 0, False
 
     def step(self, _whole: object, _now_s: float, *, with_board: bool) -> HolderMove | None:  # noqa: ARG002
         if self.ended is not None:

@@ -8,13 +8,25 @@ import pytest
 
 from fgreg.camera_moves.validity import Validity
 from fgreg.drivers.base import CommandKind
-from fgreg.live.actions import Ask, Follow, Halt, Sweep, TakePairs, TakeVerify
+from fgreg.live.actions import (
+    Ask,
+    Follow,
+    Halt,
+    Inputs,
+    LocatedPulse,
+    RegistrationState,
+    Sweep,
+    TakePairs,
+    TakeVerify,
+    Tell,
+)
 from fgreg.live.merge_looks import one_spot
 from fgreg.live.shots import pair_events
 from fgreg.live.verification import compared
-from fgreg.live.workflow import VERIFY_PMS, Stage, Workflow, WorkflowSettings
+from fgreg.live.workflow import SHOWN_S, VERIFY_PMS, Stage, Workflow, WorkflowSettings
 from fgreg.model.estimate import Verdict
 from fgreg.model.solve_config import SolveConfig
+from fgreg.model.time_sync import PoseHistory
 from fgreg.simulation.room import Room, room_config
 from fgreg.stage.limits import MotionKind
 from tests.rehearsal import Rehearsal
@@ -259,3 +271,23 @@ def test_a_bump_after_few_pms_ends_in_following_all_the_same() -> None:
 def test_settings_that_cannot_be_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(changes)).split("_")[0]):
         WorkflowSettings(**{"hearing_threshold": 1.0, **changes})  # type: ignore[arg-type]
+
+
+def test_pairs_wait_for_a_frame_that_shows_the_static_tags_at_rest() -> None:
+    def step(now_s: float, still_until_s: float, moving_s: float | None = None) -> list[TakePairs | Tell]:
+        view = Inputs(now_s, PoseHistory(), None, (), (), RegistrationState(), None, 0, moving_s, still_until_s)
+        return [action for action in workflow.step(view) if isinstance(action, TakePairs | Tell)]
+
+    def held() -> TakePairs:
+        return TakePairs(0, (LocatedPulse(10.0, 0.1), LocatedPulse(9.0, 0.1)))
+
+    workflow = rehearsal(static_tags=3).workflow
+    workflow._held = [held()]
+    assert not any(isinstance(action, TakePairs) for action in step(10.2, 9.9))
+    assert [a.pm for a in step(10.3, 10.1) if isinstance(a, TakePairs)] == [0]
+    workflow._held = [held()]
+    moved = step(10.4, 9.9, 10.2)
+    assert any(isinstance(action, Tell) and "they are not used" in action.text for action in moved)
+    assert not any(isinstance(action, TakePairs) for action in [*moved, *step(20.0, math.inf)])
+    workflow._held = [held()]
+    assert any(isinstance(action, TakePairs) for action in step(10.0 + SHOWN_S + 0.1, 9.9)), "no tag is in view"

@@ -34,6 +34,8 @@ from fgreg.model.hindrances import TOO_SLOW
 from fgreg.model.session_model import StageModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
+from fgreg.online.full_solve import FullSolveCase, FullSolveResult
+from fgreg.online.solver import InProcessSolver
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.room import Room, room_config
 from fgreg.stage.limits import MotionLimits
@@ -47,6 +49,8 @@ FIRST_OK_S, MOST_FIRST_OK_S = 200.0, 400.0
 WRONG_SHARE, OFF_SHARE, ORDERS = 0.005, 0.001, 3000
 SIGMA_RAD = MotionLimits.of_session(StageModel(math.radians(2.0), (-1.0, 1.0))).track_sigma_rad
 """An order that is less certain is refused by the stage's safety gate."""
+SOLVE_S = 1.0
+"""Time of a full solve in made-up time, on a machine that is busy."""
 BEAT = "the main program's heartbeat is missing"
 
 
@@ -131,6 +135,24 @@ def error_mm(estimate: OnlineEstimate, trus_T_camera: FloatArray, targets_mm: Fl
 # --- made-up time --------------------------------------------------------------------------------------------------
 
 
+class _LateSolver(InProcessSolver):
+    """Full solves whose results come ``SOLVE_S`` of the room's time later, as those of a worker process do."""
+
+    def __init__(self, watched: _Watched) -> None:
+        super().__init__(watched.model, SolveConfig(), verdicts=True)
+        self._watched, self._until_s = watched, -math.inf
+
+    def submit(self, case: FullSolveCase) -> None:
+        super().submit(case)
+        self.busy, self._until_s = True, self._watched.now_s + SOLVE_S
+
+    def fetch(self) -> FullSolveResult | None:
+        if not self.busy or self._watched.now_s < self._until_s:
+            return None
+        self.busy = False
+        return super().fetch()
+
+
 class _Watched(Rehearsal):
     """A rehearsal that keeps its figures. ``reports``: the operator says each bump."""
 
@@ -142,8 +164,13 @@ class _Watched(Rehearsal):
     _order: tuple[float, float] = (math.nan, -math.inf)
     _bumps: int = 0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.engine._solver = _LateSolver(self)
+
     def _frame(self) -> None:
         super()._frame()
+        self.engine.refresh()
         estimate, figures = self.engine.estimate, self.figures
         if self.reports and len(self.room.moved_s) > self._bumps:
             self._bumps = len(self.room.moved_s)

@@ -47,7 +47,7 @@ from fgreg.model.events import (
 )
 from fgreg.model.excluded_shots import excluded_shots
 from fgreg.model.known_points import data_at
-from fgreg.model.measurement_checks import look_problem, marker_problem, spot_problem
+from fgreg.model.measurement_checks import look_problem, marker_problem, of_earlier_epoch, spot_problem
 from fgreg.model.measurements import (
     Aim,
     CameraDependence,
@@ -140,7 +140,7 @@ def extract_measurements(
         pool_corner_noise(fit.pose for fit in board_fits),
         redetect,
     )
-    starts, epoch_of = number_epochs(events)
+    starts, epoch_of = number_epochs(events, redetect=redetect)
     set_aside: dict[int, Aim | Pair | KnownPoint] = {}
     for index, event in enumerate(events):
         if event.line not in refused:
@@ -178,11 +178,12 @@ def extract_measurements(
     )
 
 
-def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tuple[int, ...]]:
+def number_epochs(events: Sequence[Event], *, redetect: bool = False) -> tuple[tuple[EpochStart, ...], tuple[int, ...]]:
     """Camera epochs, and the epoch of every event.
 
     An epoch starts with its ``camera_moved`` event (unless that was refused). A detected move starts its epoch at the
-    first event at or after ``since_t``.
+    first event at or after ``since_t``, but for looks that share the marker observation of an earlier one: they belong
+    to its epoch, whenever their pulse came.
     """
     refused = refused_lines(events)
     first = events[0].t if events else 0.0
@@ -193,10 +194,25 @@ def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tupl
             continue
         since = event.since_t if event.detected and event.since_t is not None else event.t
         back = [i for i in range(index) if events[i].t >= since]
-        places.append(max(back[0] if back else index, places[-1] if places else 0))
+        place = back[0] if back else index
+        before = {_observation(event, redetect=redetect) for event in events[:place] if isinstance(event, PairEvent)}
+        while place < index and _shares(events[place], before, redetect=redetect):
+            place += 1
+        places.append(max(place, places[-1] if places else 0))
         starts.append(EpochStart(since, event.camera_new_T_camera_old, event.covariance))
     epoch_of = tuple(sum(place <= index for place in places) for index in range(len(events)))
     return tuple(starts), epoch_of
+
+
+def _observation(event: PairEvent, *, redetect: bool) -> tuple[int, object]:
+    return event.pm, _marker_key(event.marker, redetect=redetect)
+
+
+def _shares(event: Event, before: set[tuple[int, object]], *, redetect: bool) -> bool:
+    """Whether an event belongs before a move: a look with one of these marker observations, or a note."""
+    if isinstance(event, PairEvent):
+        return _observation(event, redetect=redetect) in before
+    return not isinstance(event, AimEvent | TrackEvent | PointEvent | CheckEvent | CameraMovedEvent)
 
 
 def _detect(events: Sequence[Event], model: SessionModel, redetect: bool, progress: Progress | None) -> FrameResults:
@@ -230,6 +246,7 @@ class _Builder:
         self.points: dict[int, KnownPoint] = {}
         self.unused: dict[int, str] = {}
         self.ids: dict[object, int] = {}
+        self.epochs: dict[tuple[int, int], int] = {}  # of the PMs' marker observations
         self.next_id = 0
         self.camera_matters = bool(model.constant_sigmas[CAMERA].any())
 
@@ -274,6 +291,8 @@ class _Builder:
             spot_seen = None if event.spot is None else visible_spot(event.spot, self.model)
             if isinstance(spot_seen, str):
                 self.unused[index] = spot_seen
+            elif looks and self.epochs.setdefault((event.pm, marker.id), epoch) != epoch:
+                self.unused[index] = of_earlier_epoch(event.pm)
             elif looks:
                 offset_mm = self.model.noise_per_pm.beam_offset_mm
                 self.pairs.append(Pair(event.t, event.pm, epoch, marker, looks[0], offset_mm, spot_seen))

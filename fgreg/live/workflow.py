@@ -19,6 +19,7 @@ from fgreg.live.actions import (
     Follow,
     Halt,
     Inputs,
+    LocatedPulse,
     RegistrationState,
     Release,
     StageView,
@@ -55,6 +56,8 @@ CHECK_RAD = math.radians(2.0)
 """While the stage follows, a PM detected with the plane this close to the tracking result becomes a pair."""
 CHECK_S = 0.3
 """Time between two such detections."""
+SHOWN_S = 3.0
+"""Pairs wait at most so long for a frame that shows the static tags in their place."""
 UNSEEN_S = 2.0
 """The marker is not seen once its newest pose is older; a slow machine has two frames a second."""
 ASK_AGAIN_S = 10.0
@@ -151,6 +154,7 @@ class Workflow:
         self._checks, self._checked_s = False, -math.inf
         self._verified: int | None = None  # PMs of the verification under way
         self._aims = -1  # calibration shots that were taken when the next one was asked for
+        self._held: list[TakePairs] = []  # until the camera is known to have stood still
         self._not_before_s = -math.inf  # earlier pulses belong to another epoch
 
     @property
@@ -169,6 +173,10 @@ class Workflow:
         if inputs.camera_moving_s is not None:
             # The registration is invalid. The motion request stays; the safety gate blocks the motion meanwhile.
             self._search, self._not_before_s = None, max(self._not_before_s, inputs.now_s)
+            if self._held:
+                out.append(Tell("the camera has moved during the last looks, or just after: they are not used"))
+                self._pms -= len(self._held)
+                self._held.clear()
             self._end_verification("the camera moves", out)
             return tuple(out)
         if inputs.registration.epoch != self._epoch:
@@ -179,6 +187,7 @@ class Workflow:
             self._end_verification("the camera has moved", out)
             measured = "the camera has moved, as measured: the registration goes on"
             out.append(Tell(measured if goes_on else "the camera has moved: the registration starts again"))
+        self._hand_over(inputs, out)
         self._advance(inputs, out)
         if any(isinstance(action, Ask | Halt | Release) for action in out):
             self._search = None
@@ -354,7 +363,7 @@ class Workflow:
             search, self._search = self._search, None
             out.append(Tell(f"{slipped}: hold it still"))
             if search.found is not None:  # the PM is known, and only a look from one side is missing
-                self._found(inputs.now_s, search, search.found, out)
+                self._found(inputs, search, search.found, out)
             return
         known = self._search.found is not None
         step = self._search.step(inputs.now_s, stage, inputs.pulses)
@@ -363,7 +372,7 @@ class Workflow:
                 out.append(Tell("PM detected: hold the fibre still until it was looked at from both sides"))
             out.append(Sweep(step.scan_rad, step.reason))
         elif isinstance(step, Found):
-            self._found(inputs.now_s, self._search, step, out)
+            self._found(inputs, self._search, step, out)
         elif isinstance(step, NotFound):
             self._not_found(inputs, stage, self._search, step, out)
 
@@ -417,8 +426,8 @@ class Workflow:
         if isinstance(step, Turn):
             out.append(Sweep(step.scan_rad, "to where the next search begins"))
 
-    def _found(self, now_s: float, search: PmSearch, found: Found, out: list[Action]) -> None:
-        self._search, self._done_at, self._waits_s = None, search.held, now_s
+    def _found(self, inputs: Inputs, search: PmSearch, found: Found, out: list[Action]) -> None:
+        self._search, self._done_at, self._waits_s = None, search.held, inputs.now_s
         self._found_rad.append(found.scan_rad)
         looks = tuple(look for look in search.best_looks(found) if look.marker is not None)
         if not looks:
@@ -427,9 +436,7 @@ class Workflow:
             out.append(Tell(f"the PM was detected, but cannot be paired ({why}): go on to the next spot", done=True))
             return
         if self._verified is None:
-            out.append(TakePairs(self._next_pm, looks))
-            self._next_pm += 1
-            self._pms += 1
+            self._take(looks, inputs, out)
         else:
             out.append(TakeVerify(self._verified, VERIFY_PMS, looks))
             self._verified = self._verified + 1 if self._verified + 1 < VERIFY_PMS else None
@@ -438,6 +445,20 @@ class Workflow:
         if self._settings.both_sides:
             text += ("", ", with a look from one side only", ", with looks from both sides")[len(search.first_hits)]
         out.append(Tell(f"{text}: go on to the next spot", done=True))
+
+    def _take(self, looks: tuple[LocatedPulse, ...], inputs: Inputs, out: list[Action]) -> None:
+        """Looks at one more PM."""
+        self._held.append(TakePairs(self._next_pm, looks))
+        self._next_pm += 1
+        self._pms += 1
+        self._hand_over(inputs, out)
+
+    def _hand_over(self, inputs: Inputs, out: list[Action]) -> None:
+        """Pairs once a frame after their last pulse shows that the camera has stood still, or none shows anything."""
+        shown_s = max(inputs.still_until_s, inputs.now_s - SHOWN_S)
+        waits = [pairs for pairs in self._held if max(look.pulse_s for look in pairs.looks) > shown_s]
+        out += [pairs for pairs in self._held if pairs not in waits]
+        self._held = waits
 
     def _not_found(self, inputs: Inputs, stage: StageView, search: PmSearch, why: NotFound, out: list[Action]) -> None:
         if not search.cold:
@@ -487,9 +508,7 @@ class Workflow:
             self._missed = 0 if loud else self._missed + 1
             if loud and pulse.marker is not None and self._is_another(held):
                 self._done_at = held
-                out.append(TakePairs(self._next_pm, (pulse,)))
-                self._next_pm += 1
-                self._pms += 1
+                self._take((pulse,), inputs, out)
         if self._missed == MISSED:
             moved = spelt(CommandKind.MOVED)
             text = f"the PM is not detected where the registration expects it: if the camera has moved, say {moved}"

@@ -22,6 +22,7 @@ from fgreg.model.measurements import (
     Measurements,
     Pair,
     Track,
+    observation,
 )
 from fgreg.schema.kinds import COORDINATE_MM, MAX_TRANSLATION_MM, NOT_NEGATIVE, Number
 from fgreg.schema.matrices import covariance_problem, transform_problem
@@ -57,9 +58,18 @@ def problems_of_all(measurements: Measurements, checks: Sequence[Check]) -> Iter
         for index, epoch in enumerate(each):
             if not 0 <= epoch < len(measurements.epochs):
                 yield f"{name}[{index}]", f"its epoch is {epoch}, of {len(measurements.epochs)}"
+    seen: dict[tuple[int, int], int] = {}
+    for index, pair in enumerate(measurements.pairs):
+        if seen.setdefault(observation(pair), pair.epoch) != pair.epoch:
+            yield f"pairs[{index}]", of_earlier_epoch(pair.pm)
     for index, start in enumerate(measurements.epochs):
         if (problem := motion_problem(start.camera_new_T_camera_old, start.covariance)) is not None:
             yield f"epochs[{index}]", problem
+
+
+def of_earlier_epoch(pm: int) -> str:
+    """Why a look is left out whose marker observation is known from another camera epoch."""
+    return f"the marker of PM {pm} was seen in another camera epoch, and this look has no observation of its own"
 
 
 def marker_problem(marker: MarkerObservation) -> str | None:

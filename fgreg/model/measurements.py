@@ -171,6 +171,11 @@ class Pair:
     spot: VisibleSpot | None = None
 
 
+def observation(pair: Pair) -> tuple[int, int]:
+    """PM and marker observation of a pair: looks that share it have one beam, in one camera epoch."""
+    return pair.pm, pair.marker.id
+
+
 def visible_spots(pairs: Sequence[Pair]) -> dict[tuple[int, int], VisibleSpot]:
     """The spot of each shot that has one, by PM and marker observation: a picture shows it once for all its looks."""
     spots: dict[tuple[int, int], VisibleSpot] = {}

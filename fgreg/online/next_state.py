@@ -7,7 +7,8 @@ from dataclasses import replace
 from fgreg.camera_moves.loop_closure import back_to
 from fgreg.camera_moves.static_tags import TagsAtRest, TagsMoved
 from fgreg.errors import EventRefused
-from fgreg.model.measurements import Aim, EpochStart, KnownPoint, Pair
+from fgreg.model.measurement_checks import of_earlier_epoch
+from fgreg.model.measurements import Aim, EpochStart, KnownPoint, Pair, observation
 from fgreg.online.cases import LEAST_PMS
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.smoother.state import Setting, State
@@ -34,10 +35,12 @@ def next_state(
         restoring: whether events of a recorded session are taken in again; only then loops are closed by events.
 
     Raises:
-        EventRefused: a loop that cannot be closed here.
+        EventRefused: a pair whose marker was seen before the camera moved, or a loop that cannot be closed here.
         ArithmeticError, RuntimeError: as of fgreg.smoother.updates.
     """
     if isinstance(event, Pair):
+        if any(observation(shot.pair) == observation(event) for shot in state.shots[: state.now.first]):
+            raise EventRefused(of_earlier_epoch(event.pm))
         return with_pair(state, event, setting)
     if isinstance(event, Aim):
         return with_aim(state, event, setting)
@@ -66,5 +69,13 @@ def next_state(
 
 
 def _pairs_since(state: State, t: float) -> int:
-    """Number of the epoch's pairs that were taken at ``t`` or later."""
-    return sum(shot.pair.t >= t for shot in state.current)
+    """Number of the epoch's last pairs that were taken at ``t`` or later, after the camera had moved.
+
+    Looks that share the marker observation of an earlier one belong to its epoch, whenever their pulse came.
+    """
+    shots = state.current
+    last = sum(shot.pair.t >= t for shot in shots)
+    before = {observation(shot.pair) for shot in shots[: len(shots) - last]}
+    while last and observation(shots[-last].pair) in before:
+        last -= 1
+    return last

@@ -7,6 +7,8 @@ import math
 import gtsam
 import numpy as np
 
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -61,6 +63,8 @@ def reported(
         if np.any(shift):
             pose = optimum @ gtsam.Pose3.Expmap(shift).matrix()
         verdict, reasons = report.verdict, report.reasons
+        if (far := _moved_since(report, pose, model)) is not None:
+            verdict, reasons = max(verdict, Verdict.WARNING, key=lambda v: v.severity), (far, *reasons)
     tre = gaussian_tre(covariance, pose, model.targets_mm)
     if report is not None:
         tre = with_effects(tre, report.epochs[-1].common if report.epochs else ())
@@ -72,4 +76,20 @@ def reported(
             reasons = (*reasons, condition.text)
     return OnlineEstimate(
         t, state.epoch, pose, covariance, tre, state.nis, state.used, verdict, reasons, count, optimum, False
+    )
+
+
+def _moved_since(report: Report, pose: FloatArray, model: SessionModel) -> str | None:
+    """Where the estimate is too far from that of the full solve whose verdict it would have: how far.
+
+    More pairs make it more certain, so that it stays within the bound that it had.
+    """
+    if report.trus_T_camera is None or report.predicted_tre is None:
+        return None
+    moved_mm = float(tre_mm(report.trus_T_camera, pose, model.targets_mm).max())
+    if moved_mm <= report.predicted_tre.worst_mm:
+        return None
+    return (
+        f"the last pairs have moved the estimate by {moved_mm:.1f} mm at the worst target, beyond the bound of the "
+        f"full solve before them ({report.predicted_tre.worst_mm:.1f} mm): wait for the next one"
     )
