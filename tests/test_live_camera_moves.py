@@ -206,6 +206,9 @@ class Tags:
     def still_until_s(self) -> float:
         return float("inf")
 
+    def take_report(self, _now_s: float) -> bool:
+        return self.moving_since_s is not None
+
     def news(self) -> list[str]:
         return []
 
@@ -224,7 +227,7 @@ def test_a_move_that_tags_and_arm_show_is_one_move_as_the_tags_measured_it(stand
     assert not stand.moves(), "the arm is at rest again, the tags are not"
     stand.operator.waiting.append(OperatorCommand(CommandKind.MOVED))
     stand.turn(0.05)
-    assert any("show the move already" in text for text in stand.operator.messages)
+    assert any("the static tags measure the move" in text for text in stand.operator.messages)
     measured = np.linalg.inv(MOVED) @ make_transform(np.eye(3), np.array([0.1, 0.0, 0.0]))
     tags.ended = HolderMove(since_s, measured, 1e-4 * np.eye(6))
     stand.turn(5.0, lambda: stand.recorder.state.registration.epoch > epoch and stand.link.beats[-1] is not None)
