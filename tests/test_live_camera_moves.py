@@ -195,19 +195,20 @@ class Tags:
     def __init__(self) -> None:
         self.moving_since_s: float | None = None
         self.ended: HolderMove | None = None
-        self.begun_again, self.in_doubt = 0, False
+        self.begun_again, self.in_doubt, self.reported = 0, False, False
+
+    def take_report(self, _now_s: float) -> bool:
+        self.reported = self.moving_since_s is not None
+        return self.reported
 
     def step(self, _whole: object, _now_s: float, *, with_board: bool) -> HolderMove | None:  # noqa: ARG002
         if self.ended is not None:
-            self.moving_since_s = None
+            self.moving_since_s, self.reported = None, False
         ended, self.ended = self.ended, None
         return ended
 
     def still_until_s(self) -> float:
         return float("inf")
-
-    def take_report(self, _now_s: float) -> bool:
-        return self.moving_since_s is not None
 
     def news(self) -> list[str]:
         return []
@@ -238,6 +239,34 @@ def test_a_move_that_tags_and_arm_show_is_one_move_as_the_tags_measured_it(stand
     assert np.allclose(move.camera_new_T_camera_old, measured)
     assert stand.recorder.state.registration.registered
     assert tags.begun_again == 0, "the tags' new poses are the reference of the new epoch"
+
+
+def test_nothing_is_sent_or_lost_once_a_move_is_reported(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    tags, since_s = Tags(), host_now()
+    stand.loop._static_tags = tags  # type: ignore[assignment]
+
+    def take_report(now_s: float) -> bool:
+        tags.moving_since_s, tags.reported = now_s, True
+        return True
+
+    monkeypatch.setattr(tags, "take_report", take_report)
+    monkeypatch.setattr("fgreg.live.loop.SEND_S", 0.0)
+    stand.operator.waiting.append(OperatorCommand(CommandKind.MOVED))
+    sent = len(stand.sink.sent)
+    stand.turn(0.3)
+    after = {registration.verdict for registration in stand.sink.sent[sent:]}
+    assert after == {"refused"}, "in the step of the word already"
+    command = OperatorCommand(CommandKind.CHECK, point=(100.0, 100.0, 90.0, 100.0, 0.0, 30.0))
+    stand.operator.waiting.append(command)
+    stand.turn(0.1)
+    assert any("no check: the camera moves" in text for text in stand.operator.messages)
+    assert not stand.moves()
+    stand.loop.close()  # before the tags have measured it
+    stand.recorder.close()
+    tags.reported = False
+    (move,) = stand.moves()
+    assert move.camera_new_T_camera_old is None
+    assert move.t >= stand.loop._t(since_s)
 
 
 def test_what_is_sent_without_an_estimate_or_meanwhile_is_refused(

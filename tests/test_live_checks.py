@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,17 @@ def test_a_point_that_the_operator_names_is_data_until_it_is_left_out(stand: Sta
     assert not stand.session.measurements().points
     reasons = stand.recorder.state.registration.reasons
     assert any("left out by hand (known point 0)" in reason for reason in reasons)
+
+
+def test_a_stage_that_is_not_homed_knows_no_angle_for_a_check(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    view = stand.link.view
+    assert view.status is not None
+    unhomed = replace(view, status=replace(view.status, homed=False))
+    monkeypatch.setattr(type(stand.link), "view", property(lambda _: unhomed))
+    say_check(stand, np.zeros(3), CommandKind.POINT)
+    stand.turn(1.0, lambda: any("no point: the stage is not homed" in told for told in stand.operator.messages))
+    assert any("no point: the stage is not homed" in told for told in stand.operator.messages)
+    assert not stand.session.measurements().points
 
 
 def test_pixels_that_are_of_no_point_are_answered(stand: Stand) -> None:

@@ -167,7 +167,7 @@ def test_a_drift_that_raised_an_alarm_is_recorded_also_where_its_mean_is_less(
 ) -> None:
     pictures.frames(1)
     motion = make_transform(np.eye(3), np.array([shift_mm, 0.0, 0.0]))
-    found = iter([TagsMoved(pictures.now_s), TagsAtRest(motion, np.diag(SIGMA**2))])
+    found = iter([TagsMoved(pictures.now_s), TagsAtRest(motion, np.diag(SIGMA**2), 50.0)])
     monkeypatch.setattr(static_tags, "monitored", lambda *_: (TagMonitor(), next(found)))
     move = pictures.frames(2)
     assert (move is not None) is recorded
@@ -249,6 +249,36 @@ def test_a_reported_move_that_the_tags_do_not_show_starts_the_registration_again
     assert any("show no camera move" in text for text in pictures.told)
     assert pictures.tags.moving_since_s is None
     assert pictures.frames(30) is None
+
+
+def test_noise_is_no_measurement_of_a_reported_move(pictures: Pictures, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures.frames(20)
+    assert pictures.tags.take_report(pictures.now_s)
+    by_noise = TagsAtRest(make_transform(np.eye(3), np.array([0.25, 0.0, 0.0])), np.diag(SIGMA**2), 0.6)
+    monkeypatch.setattr(static_tags, "monitored", lambda *_: (TagMonitor(), by_noise))
+    move = pictures.frames(1)
+    assert move is not None
+    assert move.camera_new_T_camera_old is None
+
+
+@pytest.mark.parametrize("frames", [SHIFTED_FRAMES, SHIFTED_FRAMES + 2])
+def test_a_move_reported_while_the_tags_shift_is_not_lost_where_they_come_back(
+    pictures: Pictures, monkeypatch: pytest.MonkeyPatch, frames: int
+) -> None:
+    pictures.frames(20)
+    with monkeypatch.context() as context:
+        if frames == SHIFTED_FRAMES:  # no pose calls it a move yet
+            context.setattr(static_tags, "static_poses", lambda _: {})
+        pictures.bump()
+        pictures.frames(frames)
+    since_s = pictures.tags.moving_since_s
+    assert since_s is not None
+    assert pictures.tags.take_report(pictures.now_s)
+    assert pictures.tags.moving_since_s == since_s
+    pictures.bump(inverse(BUMP))
+    move = pictures.frames(12)
+    assert move is not None
+    assert move.camera_new_T_camera_old is None
 
 
 def test_a_reported_move_out_of_the_tags_view_is_not_measured(pictures: Pictures) -> None:

@@ -16,6 +16,7 @@ from fgreg.live.actions import (
     LocatedPulse,
     RegistrationState,
     Sweep,
+    TakeMove,
     TakePairs,
     TakeVerify,
     Tell,
@@ -218,16 +219,15 @@ def test_with_static_tags_no_order_comes_from_a_bumped_camera_and_the_registrati
 
 def test_after_a_reported_move_it_halts_and_searches_again(whole: Rehearsal) -> None:
     # last of the tests that use the session: it changes it
-    from fgreg.online.events import CameraMoved
-
     whole._tags = None  # nobody but the operator says that the camera has moved
     whole.room.bump(whole.now_s)
     whole.run(1.0)
-    whole.engine.add(CameraMoved(whole.now_s))
     before = len(whole.actions)
+    whole.say(CommandKind.MOVED)
     whole.run(30.0)
     after = [a for _, a in whole.actions[before:]]
-    assert isinstance(after[0], Halt)
+    assert isinstance(after[0], TakeMove)
+    assert isinstance(after[1], Halt), "the step of the word follows nothing"
     assert not any(isinstance(a, Follow) for a in after)
     assert any(isinstance(a, Ask) and a.kind is MotionKind.SEARCH for a in after)
     assert any(isinstance(a, TakePairs) for a in after)

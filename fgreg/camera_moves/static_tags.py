@@ -340,10 +340,12 @@ class TagsMoved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagsAtRest:
-    """The camera is at rest again: its motion (4, 4) against the epoch before the alarm, and its covariance (6, 6)."""
+    """The camera is at rest again: its motion (4, 4) against the epoch before the alarm, its covariance (6, 6), and the
+    chi square of no motion (6 degrees of freedom)."""
 
     camera_new_T_camera_old: FloatArray
     covariance: FloatArray
+    chi2: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -397,4 +399,5 @@ def _until_rest(monitor: TagMonitor, frame: TagFrame, settings: TagSettings) -> 
     motion = tag_motion(monitor.before, average_tags(moving, settings.constant_share))
     if motion is None:
         return going_on, None
-    return TagMonitor(detector_from(moving, settings)), TagsAtRest(motion.camera_new_T_camera_old, motion.covariance)
+    at_rest = TagsAtRest(motion.camera_new_T_camera_old, motion.covariance, motion.chi2)
+    return TagMonitor(detector_from(moving, settings)), at_rest

@@ -74,6 +74,11 @@ class StageView:
     requested: MotionKind | None = None
     latched: str = ""
 
+    @property
+    def no_angle(self) -> str:
+        """What the stage is, so that its angle says nothing of the plane; empty where it does."""
+        return "turning" if self.moving else "" if self.homed else "not homed, and its angle not known"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:

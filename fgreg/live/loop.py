@@ -11,11 +11,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Protocol
 
 from fgreg.camera_moves.validity import Validity
-from fgreg.drivers.base import BmodeFrame, CommandKind, DeviceLost, Registration, host_now
+from fgreg.drivers.base import BmodeFrame, CommandKind, DeviceLost, host_now
 from fgreg.drivers.operator_words import asked
 from fgreg.live.actions import (
     Action,
@@ -44,7 +43,8 @@ from fgreg.live.pace import Pace
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
 from fgreg.live.scope_holder import Holder, HolderMove, HolderSettings
-from fgreg.live.shots import pair_events, point_event, query_event
+from fgreg.live.sent_registration import sent_registration
+from fgreg.live.shots import move_event, pair_events, point_event, query_event
 from fgreg.live.stage_commands import Steering
 from fgreg.live.static_tags import StaticTags
 from fgreg.live.status import Devices, Figures, Status
@@ -224,7 +224,9 @@ class LiveLoop:
         )
 
     def close(self) -> None:
-        """End the worker processes that the loop has started."""
+        """End the worker processes; a reported move that is not measured yet is recorded without its motion."""
+        if self._static_tags.reported:
+            self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
         self.marker_tracker.close()
         self.pulse_locator.close()
 
@@ -285,31 +287,44 @@ class LiveLoop:
             self._by_tags = move if self._by_tags is None else HolderMove(self._by_tags.since_s, None, None)
         for text in self._static_tags.news():
             self._note(text)
-        under_way = [t for t in (self._holder.moving_since_s, self._static_tags.moving_since_s) if t is not None]
-        if (self._by_tags or self._by_holder) and not under_way:
+        if (self._by_tags or self._by_holder) and self._move_under_way_s() is None:
             self._record_move(now)
-        since_s = min(under_way, default=None)
+        self._find_moving(now)
+
+    def _move_under_way_s(self) -> float | None:
+        """Host time since which the holder or the static tags show a move that has not ended; None at rest."""
+        since_s = self._holder.moving_since_s, self._static_tags.moving_since_s
+        return min((t for t in since_s if t is not None), default=None)
+
+    def _find_moving(self, now: float) -> None:
+        """Update since when the registration is invalid for a camera move."""
+        since_s = self._move_under_way_s()
         if since_s is None and self._recorder.state.camera_moving:
             since_s = now if self._camera_moving_s is None else self._camera_moving_s
         if since_s is not None and self._camera_moving_s is None:
             self._tell(Tell("the camera moves: the registration is invalid until it rests and is registered again"))
+            if self._verification.forget():
+                self._news(Tell("the verification ends without a result: the camera moves"))
         self._camera_moving_s = since_s
 
     def _record_move(self, now: float) -> None:
-        """Record the move that has ended: by the static tags where they measured it, as they are more accurate."""
+        """Record the move that has ended."""
         by_tags, by_holder = self._by_tags, self._by_holder
         self._by_tags, self._by_holder = None, []
         if by_tags is None:
             self._static_tags.begin_again()
-        measured = by_holder if by_tags is None or by_tags.covariance is None else [by_tags]
-        motion, covariance = None, None
-        if len(measured) == 1:  # of several in a row one may be missing
-            motion, covariance = measured[0].camera_new_T_camera_old, measured[0].covariance
-        event = CameraMovedEvent(self._t(now), 0, motion, covariance)
-        if by_tags is not None:  # noticed some frames after it: pairs in between belong to the new epoch
-            event = replace(event, detected=True, since_t=min(event.t, self._t(by_tags.since_s)))
-        self._recorder.hand_over(event)
+        self._recorder.hand_over(move_event(self._t(now), by_tags, by_holder, self._t))
         self.marker_tracker.begin_again(now)
+
+    def _take_report(self, now: float) -> None:
+        """Take in that the operator reports a camera move: nothing counts from now on until it is in the estimate."""
+        if self._static_tags.take_report(now):
+            self._news(Tell("the static tags measure the move: it is recorded once the camera rests"))
+        else:
+            self._static_tags.begin_again()
+            self._recorder.hand_over(CameraMovedEvent(self._t(now), 0))
+        self._find_moving(now)
+        self._tracking = None
 
     def _track_beam(self, pose: TimedPose | None) -> TrackEstimate | None:
         """Tracking result for the new pose; without one the last result, as long as its pose is recent."""
@@ -389,11 +404,7 @@ class LiveLoop:
             case TakeChoice(pm, include, by):
                 self._choose(pm, by, include=include)
             case TakeMove():
-                if self._static_tags.take_report(host_now()):
-                    self._news(Tell("the static tags measure the move: it is recorded once the camera rests"))
-                    return
-                self._static_tags.begin_again()
-                self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
+                self._take_report(host_now())
             case Tell():
                 (self._news if action.answer else self._tell)(action)
 
@@ -455,24 +466,7 @@ class LiveLoop:
         if stamp is None or begins:  # whoever has got a registration has to hear that there is none any more
             return
         self._sent = True
-        invalid = self._invalid()
-        if estimate is None or estimate.verdict is Verdict.REFUSED or invalid:
-            reasons = ("there is no registration",) if estimate is None else estimate.reasons
-            refused = (invalid,) if invalid else reasons
-            registration = Registration(stamp, Verdict.REFUSED.value, None, None, reasons=refused)
-        else:
-            tracking, stage = self._tracking, self._model.stage
-            stage_rad = None if tracking is None else tracking.stage_rad
-            registration = Registration(
-                stamp,
-                estimate.verdict.value,
-                estimate.trus_T_camera,
-                estimate.covariance,
-                None if stage_rad is None else stage.scan_from_device(stage_rad),
-                None if tracking is None else tracking.sigma_rad,
-                estimate.reasons,
-                stage_rad,
-            )
+        registration = sent_registration(stamp, estimate, self._invalid(), self._tracking, self._model.stage)
         for number, sink in enumerate(self._devices.sinks):
             try:
                 sink.send(registration)

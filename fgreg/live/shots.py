@@ -1,15 +1,18 @@
-"""Looks and checks of a live session as the events that are recorded. Pure; angles of events are the device's."""
+"""Looks, checks and camera moves of a live session as recorded events. Pure; angles of events are the device's."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from fgreg.detection.check_points import check_measurement, known_point
 from fgreg.live.actions import LocatedPulse
 from fgreg.live.merge_looks import Spot
+from fgreg.live.scope_holder import HolderMove
 from fgreg.model.events import (
+    CameraMovedEvent,
     CheckEvent,
     MarkerRecord,
     OtherRecord,
@@ -63,3 +66,22 @@ def point_event(
     event = kind(t, 0, left=np.array(point[:2]), right=np.array(point[2:4]), trus=plane)
     why = known_point(event, 0, model) if isinstance(event, PointEvent) else check_measurement(event, 0, model)
     return why if isinstance(why, str) else event
+
+
+def move_event(
+    t: float, by_tags: HolderMove | None, by_holder: Sequence[HolderMove], session_t: Callable[[float], float]
+) -> CameraMovedEvent:
+    """A camera move that has ended: by the static tags where they measured it, as they are more accurate.
+
+    Args:
+        t: session time at which it ended. session_t: session time of a host time.
+        by_tags, by_holder: what they show of it.
+    """
+    measured = by_holder if by_tags is None or by_tags.covariance is None else [by_tags]
+    motion, covariance = None, None
+    if len(measured) == 1:  # of several in a row one may be missing
+        motion, covariance = measured[0].camera_new_T_camera_old, measured[0].covariance
+    if by_tags is None:
+        return CameraMovedEvent(t, 0, motion, covariance)
+    # Noticed some frames after it: pairs in between belong to the new epoch.
+    return CameraMovedEvent(t, 0, motion, covariance, detected=True, since_t=min(t, session_t(by_tags.since_s)))

@@ -88,6 +88,7 @@ class StaticTags:
 
     Attributes:
         frames: in which a tag was found. next_s: host time from which the next one is looked at.
+        reported: whether the operator has reported the move that has not ended.
     """
 
     def __init__(self, model: SessionModel, locator: Locator) -> None:
@@ -109,9 +110,8 @@ class StaticTags:
         self._shifted: list[float] = []  # host times of frames since then with the tags elsewhere
         self._fitted = 0  # number of those whose poses are known
         self._alarm_since_s: float | None = None
-        self._reported = False  # that move, by the operator
         self._unseen = False  # no tag is in view, and the operator was told
-        self.frames = 0
+        self.frames, self.reported = 0, False
         self.next_s = -np.inf
 
     @property
@@ -145,7 +145,7 @@ class StaticTags:
 
     def begin_again(self) -> None:
         """The camera has moved, as others tell: where the tags are is learnt again, from the frames to come."""
-        self._monitor, self._alarm_since_s, self._reported = TagMonitor(), None, False
+        self._monitor, self._alarm_since_s, self.reported = TagMonitor(), None, False
         self._job, self._newest = None, self._given
         self._learn_corners()
         self._apart.clear()
@@ -153,14 +153,14 @@ class StaticTags:
 
     def take_report(self, now_s: float) -> bool:
         """The operator reports a camera move: whether the tags measure it, for :meth:`step` to return at the rest."""
-        if self.moving_since_s is not None:
-            return True
-        if now_s - self._seen_s > UNSEEN_S or not self._monitor.detector.means:
-            return False
-        self._alarm_since_s, self._unrest_s = self._shifted[0] if self._shifted else self._rest_s, now_s
-        self._monitor, self._reported = TagMonitor(before=self._monitor.detector.means), True
-        self._job, self._newest, self.next_s = None, self._given, now_s
-        self._learn_corners()
+        if self._alarm_since_s is None:
+            if now_s - self._seen_s > UNSEEN_S or not self._monitor.detector.means:
+                return False
+            self._alarm_since_s, self._unrest_s = self._shifted[0] if self._shifted else self._rest_s, now_s
+            self._monitor = TagMonitor(before=self._monitor.detector.means)
+            self._job, self._newest, self.next_s = None, self._given, now_s
+            self._learn_corners()
+        self.reported = True
         return True
 
     def step(self, whole: WholeFrame | None, now_s: float, *, with_board: bool) -> HolderMove | None:
@@ -287,12 +287,13 @@ class StaticTags:
 
     def _at_rest(self, found: TagsAtRest) -> HolderMove | None:
         since_s, self._alarm_since_s = self._alarm_since_s, None
-        reported, self._reported = self._reported, False
+        reported, self.reported = self.reported, False
         motion = found.camera_new_T_camera_old
         shift_mm = view_shift_mm(motion)
         if since_s is None:
             raise AssertionError("a rest without a move")
-        if shift_mm < BACK_SHARE * SETTINGS.least_mm:
+        by_noise = reported and found.chi2 <= SETTINGS.threshold  # else what was seen on the way is a move already
+        if by_noise or shift_mm < BACK_SHARE * SETTINGS.least_mm:
             self._news.append(NOT_SEEN if reported else BACK)
             # The operator's word stands: what has moved may be something else than the camera against these tags.
             return HolderMove(since_s, None, None) if reported else None

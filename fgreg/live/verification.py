@@ -63,8 +63,13 @@ class LiveVerification:
     def add(self, number: int, looks: Sequence[PairEvent]) -> None:
         """Add the looks at a PM; the first (``number`` 0) begins a new verification."""
         if number == 0:
-            self._looks, self._result = [], None
+            self.forget()
         self._looks += looks
+
+    def forget(self) -> bool:
+        """Give up the comparison, as the registration is no longer that one; whether one was under way."""
+        under_way, self._looks, self._result = self._result is not None, [], None
+        return under_way
 
     def compare(self, snapshot: Snapshot, config: SolveConfig) -> None:
         """Begin the comparison with a registration, with the settings that it was estimated with."""

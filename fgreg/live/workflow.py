@@ -170,7 +170,7 @@ class Workflow:
         for command in inputs.commands:
             out += self._obey(command, inputs)
         latched = inputs.stage is not None and self._is_latched(inputs.stage, inputs.now_s, out)
-        if inputs.camera_moving_s is not None:
+        if inputs.camera_moving_s is not None or any(isinstance(action, TakeMove) for action in out):
             # The registration is invalid. The motion request stays; the safety gate blocks the motion meanwhile.
             self._search, self._not_before_s = None, max(self._not_before_s, inputs.now_s)
             if self._held:
@@ -285,10 +285,12 @@ class Workflow:
                 self._search = None
                 return [TakeMove()]
             case CommandKind.CHECK | CommandKind.POINT if command.point is not None:
-                if inputs.stage is None or inputs.stage.moving:
-                    why = "not there" if inputs.stage is None else "turning"
+                if (stage := inputs.stage) is None or stage.no_angle:
+                    why = "not there" if stage is None else stage.no_angle
                     return [Tell(f"no {command.kind}: the stage is {why}", answer=True)]
-                return [TakePoint(command.kind, command.point, inputs.stage.scan_rad)]
+                if inputs.camera_moving_s is not None:
+                    return [Tell(f"no {command.kind}: the camera moves", answer=True)]
+                return [TakePoint(command.kind, command.point, stage.scan_rad)]
             case CommandKind.EXCLUDE | CommandKind.INCLUDE if command.pm is not None:
                 return [TakeChoice(command.pm, command.kind is CommandKind.INCLUDE, command.peer)]
             case CommandKind.VERIFY:
