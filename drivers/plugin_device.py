@@ -19,7 +19,7 @@ from fgreg.drivers.base import (
     StereoFrame,
 )
 from fgreg.drivers.registry import Role
-from fgreg.errors import FgregError, one_line
+from fgreg.errors import one_line
 
 ITEMS: Mapping[Role, type] = {
     Role.CAMERA: StereoFrame,
@@ -70,7 +70,7 @@ class PluginDevice:
             return 0
 
     def poll(self) -> list[Any]:
-        """Items since the last call. Raises DeviceLost, FgregError."""
+        """Items since the last call. Raises DeviceLost."""
         if self._unreported is not None:
             unreported, self._unreported = self._unreported, None
             raise unreported
@@ -81,15 +81,15 @@ class PluginDevice:
         return items
 
     def send(self, what: Registration | OverlayPicture) -> None:
-        """Send the registration, or a picture. Raises DeviceLost, FgregError."""
+        """Send the registration, or a picture. Raises DeviceLost."""
         self._called(lambda: self._device.send(what))
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
         """Show a message; an error is reported by the next ``poll``."""
         try:
             self._called(lambda: self._device.tell(text, done=done, wants=wants))
-        except FgregError as error:
-            self._unreported = error if isinstance(error, DeviceLost) else DeviceLost(str(error))
+        except DeviceLost as error:
+            self._unreported = error
 
     def close(self) -> None:
         """Release the device."""
@@ -99,8 +99,8 @@ class PluginDevice:
     def _called(self, call: Callable[[], T]) -> T:
         try:
             return call()
-        except FgregError:
+        except DeviceLost:
             raise
-        except Exception as error:
+        except Exception as error:  # also another error of fgreg: the loop knows of losses only
             why = one_line(f"{type(error).__name__}: {error}", 200)
             raise DeviceLost(f"{self._driver}: an error of its driver: {why}") from error

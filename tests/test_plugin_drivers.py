@@ -6,7 +6,7 @@ import importlib
 import sys
 import threading
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -165,6 +165,28 @@ def test_devices_describes_them_as_it_does_ours(tmp_path: Path) -> None:
     assert found["photoacoustic"].says == "30.0 a second, 128 x 16 int16, its own clock"
     assert found["stage"].says.endswith("deg by its own account, knows its zero position")
     assert set(PluginDevice.__dict__) >= {"poll", "send", "tell", "name", "connected", "dropped", "close"}
+
+
+@pytest.mark.parametrize("error", [InputError("port", "closed", "open"), FgregError("no such thing"), KeyError("x")])
+def test_whatever_another_packages_driver_raises_is_a_loss_of_its_device(error: Exception) -> None:
+    class Broken:
+        name, connected, dropped = "broken", True, 0
+
+        def poll(self) -> list[object]:
+            raise error
+
+        def send(self, _what: object) -> None:
+            raise error
+
+        def tell(self, _text: str, **_more: object) -> None:
+            raise error
+
+    device = PluginDevice(Role.OPERATOR, "fgreg_lab:Broken", Broken())
+    device.tell("a message")
+    calls: list[Callable[[], object]] = [device.poll, device.poll, lambda: device.send(None)]  # type: ignore[arg-type]
+    for call in calls:
+        with pytest.raises(DeviceLost, match=type(error).__name__):
+            call()
 
 
 def test_drivers_of_other_packages_are_listed_with_their_keys() -> None:
