@@ -177,6 +177,7 @@ class Endoscope:
         self._held: list[StereoFrame] = []
         self._told_right = False
         self._cadence = _Cadence()
+        self._misfits, self._left_out = False, 0  # whether the last frame did not fit; number of those
 
     @property
     def name(self) -> str:
@@ -185,8 +186,8 @@ class Endoscope:
 
     @property
     def connected(self) -> bool:
-        """Whether all inputs deliver."""
-        return all(entry.connected for entry in self._inputs)
+        """Whether all inputs deliver, and what fits."""
+        return not self._misfits and all(entry.connected for entry in self._inputs)
 
     @property
     def ended(self) -> bool:
@@ -195,15 +196,15 @@ class Endoscope:
 
     @property
     def dropped(self) -> int:
-        """Number of frames that were not fetched in time or had no partner."""
-        return sum(entry.dropped for entry in self._inputs) + self._matcher.dropped
+        """Number of frames that were not fetched in time, had no partner, or did not fit."""
+        return sum(entry.dropped for entry in self._inputs) + self._matcher.dropped + self._left_out
 
     def poll(self) -> list[StereoFrame]:
         """Frames since the last call, oldest first.
 
         Raises:
-            DeviceLost: an input is lost; once for each loss, with what continues without it.
-            InputError: frames that do not fit the layout or the rectification.
+            DeviceLost: an input is lost; once for each loss, with what continues without it. Or frames do not fit the
+                layout or the rectification; it is connected again with the first one that does.
         """
         grabbed: list[Sequence[Grabbed]] = []
         for i, entry in enumerate(self._inputs):
@@ -220,7 +221,13 @@ class Endoscope:
             pairs = self._matcher.take(grabbed[0], grabbed[1], right_expected=not self._told_right)
         else:
             pairs = [(entry, None) for entry in grabbed[0]]
-        self._held += [frame for left, right in pairs for frame in self._frames(left, right)]
+        for left, right in pairs:
+            misfitted, self._misfits = self._misfits, False
+            try:
+                self._held += self._frames(left, right)
+            except InputError as error:
+                self._misfits, self._left_out = True, self._left_out + 1
+                self._losses += [] if misfitted else [DeviceLost(str(error))]
         if self._losses:
             raise self._losses.pop(0)  # the frames are returned by the next call
         frames, self._held = self._held, []

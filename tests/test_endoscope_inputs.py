@@ -107,13 +107,25 @@ def test_frames_that_hold_both_views_are_halved(tmp_path: Path, layout: Layout, 
 
 
 def test_a_layout_that_does_not_fit_the_frames_is_reported(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "0.png"), shade(3, (65, 48)))
-    endoscope = Endoscope(EndoscopeConfig(InputConfig(str(tmp_path), loop=True), layout=Layout.SIDE_BY_SIDE))
+    for number, width in enumerate((65, 65, *[64] * 30)):
+        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), shade(3, (width, 48)))
+    endoscope = Endoscope(EndoscopeConfig(InputConfig(str(tmp_path)), layout=Layout.SIDE_BY_SIDE))
     try:
-        with pytest.raises(InputError, match="65 x 48 px, expected frames that can be halved"):
-            collect(endoscope, lambda frames, _: bool(frames))
+        connected: list[bool] = []
+
+        def enough(frames: list[StereoFrame], losses: list[str]) -> bool:
+            if len(losses) == 1 and not frames:
+                connected.append(endoscope.connected)
+            return bool(frames)
+
+        frames, losses = collect(endoscope, enough)
     finally:
         endoscope.close()
+    assert frames[0].left.shape[:2] == (48, 32)
+    (misfit,) = [loss for loss in losses if "65 x 48 px, expected frames that can be halved" in loss]
+    assert misfit == losses[0]
+    assert not connected[0]
+    assert endoscope.dropped == 2
 
 
 def test_interlaced_frames_give_two_half_height_pictures_half_a_period_apart(tmp_path: Path) -> None:

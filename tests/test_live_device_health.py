@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 
 from fgreg.drivers.base import DeviceLost, StereoFrame
 from fgreg.live.device_health import FLAT, LEFT_OUT_S, NOTHING_NEW_S, SILENT_S, START_S, Health, Pictures, Source
+from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.time_sync import Stamp
 
 FRAME_S = 1.0 / 30.0
@@ -107,6 +108,22 @@ def test_black_plain_and_white_pictures_are_reported(level: float, trouble: str)
     assert trouble in pictures.trouble(29 * FRAME_S)
     assert pictures.is_new(frame(rng), 30 * FRAME_S)
     assert pictures.trouble(30 * FRAME_S) == ""
+
+
+def test_pictures_of_another_size_than_calibrated_are_not_used() -> None:
+    rng = np.random.default_rng(5)
+    first = frame(rng)
+    height, width = first.left.shape[:2]
+    camera = CameraModel((width, height), np.eye(3), np.zeros(4))
+    pictures = Pictures(StereoRig(camera, CameraModel((width, height // 2), np.eye(3), np.zeros(4)), np.eye(4)))
+    assert not pictures.is_new(first, 0.0)
+    assert pictures.trouble(0.0) == (
+        f"its pictures have {width} x {height} px, the calibration is for {width} x {height // 2}"
+    )
+    for size, fits in (((width, height), True), ((2 * width, height), False)):
+        pictures = Pictures(StereoRig(CameraModel(size, np.eye(3), np.zeros(4))))
+        assert pictures.is_new(replace(first, right=None), 0.0) is fits
+        assert bool(pictures.trouble(0.0)) is not fits
 
 
 def test_a_video_that_stops_is_reported_and_single_pictures_are_no_video() -> None:

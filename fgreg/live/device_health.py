@@ -1,7 +1,7 @@
 """Monitors the devices: which are lost and why, which are back, and the messages about it.
 
 A device is lost if its driver says so, if it does not answer, or if its data are useless: a camera whose picture is
-frozen or blank. Every loss is detected well within a second.
+frozen, blank, or of another size than calibrated. Every loss is detected well within a second.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.drivers.base import DeviceLost, StereoFrame
+from fgreg.model.camera_model import StereoRig
 
 START_S = 5.0
 """Longest time until a device's first data."""
@@ -108,20 +109,29 @@ class Source:
 
 
 class Pictures:
-    """Detects frozen and blank pictures of a camera."""
+    """Detects pictures of a camera that are frozen, blank, or of another size than it was calibrated with.
 
-    def __init__(self) -> None:
+    Args:
+        rig: the calibration; None: any size will do.
+    """
+
+    def __init__(self, rig: StereoRig | None = None) -> None:
+        cameras = [] if rig is None else [rig.left, rig.left if rig.right is None else rig.right]
+        self._sizes = [camera.image_size for camera in cameras]
+        self._misfit = ""
         self._before: tuple[npt.NDArray[Any], ...] = ()
         self._came_s = self._new_s = self._showed_s = math.nan
         self._interval_s = math.inf
         self._side = ""
 
     def is_new(self, frame: StereoFrame, now_s: float) -> bool:
-        """Take in a frame; whether all its pictures differ from those before.
+        """Take in a frame; whether it can be used: all its pictures differ from those before, and their size fits.
 
-        A repeated picture carries no new measurement, whatever its time stamp.
+        A repeated picture carries no new measurement, whatever its time stamp. In one of another size the calibration
+        gives a wrong pose.
         """
         sides = [frame.left] if frame.right is None else [frame.left, frame.right]
+        self._misfit = self._other_size([(side.shape[1], side.shape[0]) for side in sides])
         samples = tuple(side[::ROWS, ::COLUMNS].copy() for side in sides)
         repeated = self._repeated_side(samples)
         both = zip(("left", "right"), samples, strict=False)
@@ -137,7 +147,13 @@ class Pictures:
         if not flat:
             self._showed_s = now_s
         self._side = repeated or flat
-        return not repeated
+        return not (repeated or self._misfit)
+
+    def _other_size(self, found: Sequence[tuple[int, int]]) -> str:
+        for (width, height), (wide, high) in zip(found, self._sizes, strict=False):
+            if (width, height) != (wide, high):
+                return f"its pictures have {width} x {height} px, the calibration is for {wide} x {high}"
+        return ""
 
     def _repeated_side(self, samples: tuple[npt.NDArray[Any], ...]) -> str:
         if len(samples) != len(self._before):
@@ -149,6 +165,8 @@ class Pictures:
         """What is wrong; empty if nothing is."""
         if self._interval_s <= VIDEO_S and now_s - self._came_s > SILENT_S:
             return "it sends no pictures"
+        if self._misfit:
+            return self._misfit
         if self._came_s - self._new_s > NOTHING_NEW_S:
             return f"its {self._side} picture is frozen: the same again and again"
         if self._came_s - self._showed_s > NOTHING_NEW_S:

@@ -128,7 +128,7 @@ class LiveLoop:
         self._camera_moving_s: float | None = None
         self.figures = Figures()
         self._began_s = host_now()
-        self._health, self._pictures = Health(), Pictures()
+        self._health, self._pictures = Health(), Pictures(model.camera)
         self._sources = {
             role: Source(device, self._began_s, sends=role in SENDERS) for role, device in devices.roles().items()
         }
@@ -140,7 +140,7 @@ class LiveLoop:
         )
         self._text, self._task, self._number, self._unshown = "", "", 0, 0
         self._pace = Pace(self._began_s)
-        self._unused = 0  # frames that were older than another, or repeated
+        self._unused = 0  # frames that were older than another, repeated, or of another size
         self._bmode: BmodeFrame | None = None
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._sent = False  # whether the sinks have got anything
