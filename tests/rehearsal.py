@@ -117,6 +117,7 @@ class Rehearsal:
         obliging: whether the operator gives the commands that are asked for.
         frame_s: interval of the pictures.
         no_source_from_s: from this time the probe detects nothing. no_marker_from_s: the camera sees no marker.
+        no_picture_from_s: no picture is looked at.
         latched: why the stage may not move, as from the safety gate; a release clears it.
         messages: all messages to the operator, with their times. actions: all other actions.
         begun_mm: error of the registration and its prediction when the stage began to follow; set by the test.
@@ -129,6 +130,7 @@ class Rehearsal:
     frame_s: float = 1.0 / 30.0
     no_source_from_s: float = math.inf
     no_marker_from_s: float = math.inf
+    no_picture_from_s: float = math.inf
     latched: str = ""
     now_s: float = 0.0
     messages: list[tuple[float, Tell]] = field(default_factory=list)
@@ -171,7 +173,7 @@ class Rehearsal:
         room.pass_to(now)
         if self._tags is not None:
             self._follow_camera(self._tags)
-        if now < self.no_marker_from_s:
+        if now < min(self.no_marker_from_s, self.no_picture_from_s):
             self.poses.add(self._observed(now))
         status = self.stage.status()
         heard = []
@@ -204,6 +206,7 @@ class Rehearsal:
             self._aims,
             None if self._tags is None else self._tags.moving_since_s,
             math.inf if self._tags is None else self._tags.still_until_s(),
+            min(now, self.no_picture_from_s),
         )
         self._said = []
         for action in self.workflow.step(view):

@@ -97,6 +97,7 @@ class Inputs:
             the estimate: the registration is invalid. None while it is valid.
         still_until_s: host time of the newest frame in which static tags show that the camera stands: newer poses of
             the marker are not followed. Infinite where no static tags are in view.
+        pictured_s: host time of the newest picture in which the marker was looked for.
     """
 
     now_s: float
@@ -109,6 +110,7 @@ class Inputs:
     aims: int
     camera_moving_s: float | None = None
     still_until_s: float = math.inf
+    pictured_s: float = math.inf
 
 
 # --- what the workflow asks for -----------------------------------------------------------------------------------

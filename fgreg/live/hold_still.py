@@ -1,4 +1,4 @@
-"""Whether the fibre is held still. The hand's tremor and the detection's noise do not count as motion."""
+"""Whether the fibre is held still, and seen. The hand's tremor and the detection's noise do not count as motion."""
 
 from __future__ import annotations
 
@@ -15,6 +15,22 @@ FEWEST = 4
 """Least number of poses."""
 SLOW_S = 2.0
 """Where fewer than that come in ``STILL_S``, the last ones count up to this long: a slow machine has few frames."""
+
+NOT_SEEN = "the marker is not seen"
+NO_PICTURE = "no new picture was looked at"
+UNSEEN_S = 2.0
+"""The marker is not seen once its newest pose is older; a slow machine has two frames a second."""
+
+
+def unseen(poses: PoseHistory, pictured_s: float, now_s: float) -> str:
+    """Why there is no recent pose of the marker; empty if there is one.
+
+    ``pictured_s``: host time of the newest picture that was looked at. Without one the marker may well be in view.
+    """
+    newest = poses.newest()
+    if newest is not None and now_s - newest.t_s <= UNSEEN_S:
+        return ""
+    return NOT_SEEN if now_s - pictured_s <= UNSEEN_S else NO_PICTURE
 
 
 def held_pose(poses: PoseHistory, now_s: float, over_s: float = STILL_S) -> FloatArray | None:

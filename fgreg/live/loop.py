@@ -367,6 +367,7 @@ class LiveLoop:
             state.aims,
             self._camera_moving_s,
             self._static_tags.still_until_s(),
+            -math.inf if self.marker_tracker.newest is None else self.marker_tracker.newest.stamp.host_s,
         )
 
     # --- out --------------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from fgreg.live.actions import (
     TakeVerify,
     Tell,
 )
-from fgreg.live.hold_still import held_pose, moved_mm, turned_rad
+from fgreg.live.hold_still import NO_PICTURE, held_pose, moved_mm, turned_rad, unseen
 from fgreg.live.pm_search import PmSearch
 from fgreg.live.time_spent import TimeSpent
 from fgreg.model.estimate import Verdict
@@ -58,8 +58,6 @@ CHECK_S = 0.3
 """Time between two such detections."""
 SHOWN_S = 3.0
 """Pairs wait at most so long for a frame that shows the static tags in their place."""
-UNSEEN_S = 2.0
-"""The marker is not seen once its newest pose is older; a slow machine has two frames a second."""
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
 """Wait after which the operator gets a message about what is missing."""
@@ -383,8 +381,10 @@ class Workflow:
         if inputs.now_s - self._waits_s < PATIENCE_S:
             return
         self._waits_s = inputs.now_s
-        newest = inputs.poses.newest()
-        if newest is None or inputs.now_s - newest.t_s > UNSEEN_S:
+        why = unseen(inputs.poses, inputs.pictured_s, inputs.now_s)
+        if why == NO_PICTURE:
+            out.append(Tell("no new picture was looked at: hold the fibre where it is"))
+        elif why:
             out.append(Tell("the marker is not seen: hold the fibre elsewhere", done=True))
         elif held is None:
             out.append(Tell("hold the fibre still", done=False))
@@ -472,9 +472,9 @@ class Workflow:
 
     def _slipped(self, inputs: Inputs, search: PmSearch) -> str | None:
         """Why a search has to end; None if it goes on."""
-        newest = inputs.poses.newest()
-        if newest is None or inputs.now_s - newest.t_s > UNSEEN_S:
-            return "the marker is not seen"
+        newest, why = inputs.poses.newest(), unseen(inputs.poses, inputs.pictured_s, inputs.now_s)
+        if newest is None or why:
+            return why
         pose = newest.parent_T_child
         if moved_mm(pose, search.held) > SLIP_MM or turned_rad(pose, search.held) > SLIP_RAD:
             return "the fibre has moved during the search"
