@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from fgreg.drivers.base import CommandKind, OperatorCommand, RefusedWord, host_now
+from fgreg.errors import FgregError
+from fgreg.live import recorder
 from fgreg.live.actions import LocatedPulse, TakeVerify
 from fgreg.live.workflow import Workflow
 from fgreg.model.estimate import Verdict
@@ -88,3 +90,29 @@ def test_what_the_operator_says_has_its_effect_or_is_refused_and_noted(
     notes = [event.text for event in events if isinstance(event, NoteEvent)]
     assert any(note.startswith("verify: ") for note in notes)
     assert len([note for note in notes if "next from the operator is refused" in note]) == 1
+
+
+def test_a_choice_whose_engine_does_not_start_leaves_no_registration_with_the_shot(
+    pose_session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with standing(pose_session) as stand:
+        stand.turn(0.3)
+        revive, fails = stand.session.revive, [True]
+
+        def failing() -> object:
+            if fails[0]:
+                stand.session._gone = True
+                raise FgregError("no process can be started")
+            return revive()
+
+        monkeypatch.setattr(stand.session, "revive", failing)
+        say(stand, OperatorCommand(CommandKind.EXCLUDE, pm=3))
+        stand.turn(2.0, lambda: "no process" in stand.recorder.state.trouble)
+        beats = len(stand.link.beats)
+        stand.turn(0.5)
+        assert set(stand.link.beats[beats:]) == {None}
+        assert stand.loop.status().invalid
+        fails[0] = False
+        monkeypatch.setattr(recorder, "AGAIN_S", 0.0)
+        stand.turn(10.0, lambda: stand.link.beats[-1] is not None)
+        assert stand.recorder.state.excluded == {3}

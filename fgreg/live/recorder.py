@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from fgreg.errors import EventRefused, FgregError, JournalError
+from fgreg.errors import EventRefused, FgregError, InputError, JournalError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.live.actions import RegistrationState
 from fgreg.model.estimate import Verdict
@@ -256,10 +256,12 @@ class Recorder:
                 self._choices -= 1
             self._revive()
             return True
-        except FgregError as error:  # it is on disk; the next refresh finds the engine gone and starts another
+        except FgregError as error:
             with self._lock:
                 self._choices -= 1
-                self._state = replace(self._state, trouble=str(error), choosing=self._choices > 0)
+                # What is on disk counts: the next refresh finds the engine gone and starts another.
+                choosing = self._choices > 0 or not isinstance(error, InputError)
+                self._state = replace(self._state, trouble=str(error), choosing=choosing)
             return True
         self._began_again(self._recorded(), 1)
         return True
