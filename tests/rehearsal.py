@@ -38,6 +38,7 @@ from fgreg.live.actions import (
 )
 from fgreg.live.marker_tracker import WholeFrame
 from fgreg.live.merge_looks import one_spot
+from fgreg.live.shots import move_event
 from fgreg.live.static_tags import StaticTags
 from fgreg.live.workflow import Workflow, WorkflowSettings
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
@@ -226,8 +227,9 @@ class Rehearsal:
         move = tags.step(whole, self.now_s, with_board=False)
         self.messages += [(self.now_s, Tell(text)) for text in tags.news()]
         if move is not None:
-            since = min(self.now_s, move.since_s)
-            self.engine.add(CameraMoved(self.now_s, move.camera_new_T_camera_old, move.covariance, True, since))
+            told = move_event(self.now_s, move, [], lambda host_s: host_s)
+            motion, covariance = told.camera_new_T_camera_old, told.covariance
+            self.engine.add(CameraMoved(told.t, motion, covariance, told.detected, told.since_t))
             self.poses.clear()
 
     def _do(self, action: Action) -> None:

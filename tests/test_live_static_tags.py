@@ -25,6 +25,7 @@ from fgreg.live import static_tags
 from fgreg.live.launch import setup_text
 from fgreg.live.marker_tracker import WholeFrame
 from fgreg.live.scope_holder import HolderMove
+from fgreg.live.shots import move_event
 from fgreg.live.static_tags import MOST_ALARMS, SHIFTED_FRAMES, UNREST_S, UNSEEN_S, StaticTags
 from fgreg.model.events import CameraMovedEvent
 from fgreg.model.session_model import SessionModel
@@ -247,6 +248,8 @@ def test_a_reported_move_that_the_tags_do_not_show_starts_the_registration_again
     assert move is not None
     assert move.camera_new_T_camera_old is None
     assert any("show no camera move" in text for text in pictures.told)
+    event = move_event(pictures.now_s, move, [], lambda host_s: host_s)
+    assert not event.detected, "it was reported, and nothing was measured"
     assert pictures.tags.moving_since_s is None
     assert pictures.frames(30) is None
 

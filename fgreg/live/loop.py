@@ -283,8 +283,9 @@ class LiveLoop:
         move = self._static_tags.step(self.marker_tracker.whole, now, with_board=not aiming)
         if self._static_tags.in_doubt:
             self.marker_tracker.search_whole()
-        if move is not None:  # of two in a row the second one alone is not the motion
-            self._by_tags = move if self._by_tags is None else HolderMove(self._by_tags.since_s, None, None)
+        if move is not None and (first := self._by_tags) is not None:  # the second one alone is not the motion
+            move = HolderMove(first.since_s, None, None, first.reported or move.reported)
+        self._by_tags = move or self._by_tags
         for text in self._static_tags.news():
             self._note(text)
         if (self._by_tags or self._by_holder) and self._move_under_way_s() is None:

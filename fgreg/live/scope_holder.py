@@ -64,12 +64,13 @@ class HolderMove:
     """A move that has ended; it began at host time ``since_s`` or just before.
 
     ``camera_new_T_camera_old`` (4, 4) with its covariance (6, 6), right tangent (rad, mm); both None if the holder was
-    silent meanwhile, so that the motion is unknown.
+    silent meanwhile, so that the motion is unknown. ``reported``: by the operator, too.
     """
 
     since_s: float
     camera_new_T_camera_old: FloatArray | None
     covariance: FloatArray | None
+    reported: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

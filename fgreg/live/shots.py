@@ -81,7 +81,7 @@ def move_event(
     motion, covariance = None, None
     if len(measured) == 1:  # of several in a row one may be missing
         motion, covariance = measured[0].camera_new_T_camera_old, measured[0].covariance
-    if by_tags is None:
+    if by_tags is None or (by_tags.reported and motion is None):  # else it would count as a move that no one reported
         return CameraMovedEvent(t, 0, motion, covariance)
     # Noticed some frames after it: pairs in between belong to the new epoch.
     return CameraMovedEvent(t, 0, motion, covariance, detected=True, since_t=min(t, session_t(by_tags.since_s)))

@@ -177,7 +177,7 @@ class StaticTags:
         if before_s is None and since_s is not None and self._too_often(now_s):
             return HolderMove(since_s, None, None)
         if since_s is not None and now_s - self._unrest_s > UNREST_S:
-            move = HolderMove(since_s, None, None)
+            move = HolderMove(since_s, None, None, self.reported)
             self.begin_again()
         if self.in_use and self._job is None and whole is not None and whole is not self._newest:
             board = with_board and self._board is not None and now_s >= self._board_s
@@ -296,12 +296,12 @@ class StaticTags:
         if by_noise or shift_mm < BACK_SHARE * SETTINGS.least_mm:
             self._news.append(NOT_SEEN if reported else BACK)
             # The operator's word stands: what has moved may be something else than the camera against these tags.
-            return HolderMove(since_s, None, None) if reported else None
+            return HolderMove(since_s, None, None, reported) if reported else None
         self._news.append(
             "the static tags show that the camera has moved: "
             f"{shift_mm:.1f} mm and {math.degrees(turn_rad(motion)):.1f} deg"
         )
-        return HolderMove(since_s, motion, move_covariance(motion, found.covariance))
+        return HolderMove(since_s, motion, move_covariance(motion, found.covariance), reported)
 
     def _check_tags(self, frame: TagFrame) -> None:
         """Leave out tags that do not stand still, or that go their own way."""

@@ -171,6 +171,7 @@ class Workflow:
         if inputs.camera_moving_s is not None or any(isinstance(action, TakeMove) for action in out):
             # The registration is invalid. The motion request stays; the safety gate blocks the motion meanwhile.
             self._search, self._not_before_s = None, max(self._not_before_s, inputs.now_s)
+            self._waits_s = inputs.now_s  # the marker's poses from before are dropped: it is not unseen
             if self._held:
                 out.append(Tell("the camera has moved during the last looks, or just after: they are not used"))
                 self._pms -= len(self._held)
