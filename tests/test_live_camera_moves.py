@@ -197,6 +197,9 @@ class Tags:
         self.ended: HolderMove | None = None
         self.begun_again, self.in_doubt, self.reported = 0, False, False
 
+    def note_epoch(self, _number: int, _now_s: float, *, waits: bool) -> None:
+        pass
+
     def take_report(self, _now_s: float) -> bool:
         self.reported = self.moving_since_s is not None
         return self.reported

@@ -284,6 +284,32 @@ def test_a_move_reported_while_the_tags_shift_is_not_lost_where_they_come_back(
     assert move.camera_new_T_camera_old is None
 
 
+@pytest.mark.parametrize(
+    ("waits", "seen_again", "known"), [(False, False, False), (True, False, True), (False, True, True)]
+)
+def test_a_move_that_the_pairs_showed_while_no_tag_was_in_view_is_not_measured_again(
+    pictures: Pictures, waits: bool, seen_again: bool, known: bool
+) -> None:
+    pictures.tags.note_epoch(0, 0.0, waits=False)
+    pictures.frames(20)
+    poses = pictures.poses
+    if not seen_again:
+        pictures.bump()
+    moved, pictures.poses = pictures.poses, {}
+    pictures.frames(10)
+    pictures.tags.note_epoch(0, pictures.now_s, waits=waits)
+    pictures.tags.note_epoch(1, pictures.now_s, waits=False)
+    pictures.frames(10)
+    pictures.poses = moved
+    if seen_again:  # where they were: what comes then is another move
+        assert poses is moved
+        pictures.frames(3)
+        pictures.bump()
+    move = pictures.frames(10)
+    assert move is not None
+    assert (move.camera_new_T_camera_old is not None) is known
+
+
 def test_a_reported_move_out_of_the_tags_view_is_not_measured(pictures: Pictures) -> None:
     pictures.frames(20)
     assert not pictures.tags.take_report(pictures.now_s + UNSEEN_S + 1.0)

@@ -279,7 +279,8 @@ class LiveLoop:
         if self._devices.motion is not None:
             move = self._holder.take(self._sources["motion"].poll(), now)
             self._by_holder += [] if move is None else [move]
-        aiming = self._workflow.stage is Stage.AIMING
+        aiming, state = self._workflow.stage is Stage.AIMING, self._recorder.state
+        self._static_tags.note_epoch(state.registration.epoch, now, waits=state.camera_moving)
         move = self._static_tags.step(self.marker_tracker.whole, now, with_board=not aiming)
         if self._static_tags.in_doubt:
             self.marker_tracker.search_whole()

@@ -111,6 +111,8 @@ class StaticTags:
         self._fitted = 0  # number of those whose poses are known
         self._alarm_since_s: float | None = None
         self._unseen = False  # no tag is in view, and the operator was told
+        self._rested_s = self._split_s = -np.inf  # last frame at rest before the alarm; see note_epoch
+        self._epoch, self._waited = 0, True
         self.frames, self.reported = 0, False
         self.next_s = -np.inf
 
@@ -151,13 +153,24 @@ class StaticTags:
         self._apart.clear()
         self._disagree = 0
 
+    def note_epoch(self, number: int, now_s: float, *, waits: bool) -> None:
+        """Take in the registration's camera epoch; ``waits``: for a recorded move, which begins the next one.
+
+        An epoch without one began where the pairs showed a move. If no frame has shown the tags in their place since,
+        as they were out of view, what they measure next may be that move: it is no motion from the epoch that it began.
+        """
+        waited, self._waited = self._waited or waits, waits
+        if number != self._epoch and not waited:
+            self._split_s = now_s
+        self._epoch = number
+
     def take_report(self, now_s: float) -> bool:
         """The operator reports a camera move: whether the tags measure it, for :meth:`step` to return at the rest."""
         if self._alarm_since_s is None:
             if now_s - self._seen_s > UNSEEN_S or not self._monitor.detector.means:
                 return False
             self._alarm_since_s, self._unrest_s = self._shifted[0] if self._shifted else self._rest_s, now_s
-            self._monitor = TagMonitor(before=self._monitor.detector.means)
+            self._monitor, self._rested_s = TagMonitor(before=self._monitor.detector.means), self._rest_s
             self._job, self._newest, self.next_s = None, self._given, now_s
             self._learn_corners()
         self.reported = True
@@ -261,6 +274,7 @@ class StaticTags:
         self._monitor, found = monitored(self._monitor, job.t_s, frame, SETTINGS)
         if isinstance(found, TagsMoved):
             self._alarm_since_s, self._unrest_s = self._shifted[0] if self._shifted else found.since_t, now_s
+            self._rested_s = self._rest_s
             self._learn_corners()
             return None
         if isinstance(found, TagsAtRest):
@@ -301,6 +315,8 @@ class StaticTags:
             "the static tags show that the camera has moved: "
             f"{shift_mm:.1f} mm and {math.degrees(turn_rad(motion)):.1f} deg"
         )
+        if self._rested_s < self._split_s:
+            return HolderMove(since_s, None, None, reported)
         return HolderMove(since_s, motion, move_covariance(motion, found.covariance), reported)
 
     def _check_tags(self, frame: TagFrame) -> None:
