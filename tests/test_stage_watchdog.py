@@ -166,6 +166,17 @@ def test_order_that_cannot_be_logged_is_not_given_but_a_stop_is(session: _Sessio
     session.until(lambda: any(report.what == "stopped" for report in session.reports))
 
 
+def test_a_stop_does_not_wait_for_its_log(session: _Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    session.link.request(MotionKind.SEARCH, "pedal")
+    session.link.search_to(math.radians(30.0), "far")
+    session.until(lambda: "move" in session.commands())
+    # A log that waits for the disk: no heartbeat comes meanwhile, which stops the stage, too, but later.
+    monkeypatch.setattr(session.link, "_log", lambda _: wait_until(lambda: session.commands()[-1] == "stop"))
+    session.link.stop("enough")
+    written = (session.folder / "watchdog.log").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["reason"] for line in written[1:3]] == ["far", "enough"]
+
+
 def test_refusals_and_stops_are_reported_and_stops_are_logged(session: _Session) -> None:
     number = session.link.track_to(0.1, 0.01, "beam")
     session.until(lambda: session.reports)

@@ -8,8 +8,8 @@
             stage.track_to(scan_rad, sigma_rad, "the beam moved")
 
 The heartbeat has to come from the loop whose stalling matters; a separate thread would go on beating. Every order is
-passed to ``log`` before it is sent; if that raises, only a stop is still sent. Leaving the ``with`` block by an
-exception, Ctrl-C, an uncaught exception in any thread, the end of the interpreter and
+passed to ``log`` before it is sent, and is not sent if that raises; a stop is sent first. Leaving the ``with`` block by
+an exception, Ctrl-C, an uncaught exception in any thread, the end of the interpreter and
 ``stop_on_exit.emergency_stop_all`` all stop the stage. If the main program is killed or stalls, the watchdog stops it.
 """
 
@@ -146,7 +146,8 @@ class StageLink:
         Args:
             driver: ``package.module:factory`` of the stage's driver.
             options: keyword arguments of the factory, as JSON holds them.
-            log: gets every order before it is sent, and each stop of the watchdog's own once it is reported.
+            log: gets every order before it is sent, a stop after that, and each stop of the watchdog's own once it is
+                reported.
             watchdog_log: the watchdog's own log file, which also has stops after the main program has ended.
 
         Raises:
@@ -216,11 +217,12 @@ class StageLink:
         return self._command(MotionKind.TRACK, scan_rad, speed_rad_s, sigma_rad, reason)
 
     def stop(self, reason: str) -> None:
-        """Stop; the operator has to request again."""
+        """Stop; the operator has to request again. It is logged once it is sent: a log may wait for the disk."""
+        now = time.monotonic()
         try:
-            self._log(StageRecord(time.monotonic(), "stop", None, reason))
+            self._send(Stop(now, False, reason))
         finally:
-            self._send(Stop(time.monotonic(), False, reason))
+            self._log(StageRecord(now, "stop", None, reason))
 
     def emergency_stop(self, reason: str) -> None:
         """Stop now, and latch until :meth:`reset`. Works from any thread, and if the socket is blocked."""
