@@ -14,10 +14,11 @@ from rich.console import Console
 
 from fgreg.cli.live_display import page as terminal_page
 from fgreg.cli.live_display import status_rows, word_rows
-from fgreg.drivers.base import BmodeFrame
+from fgreg.drivers.base import BmodeFrame, host_now
 from fgreg.live.actions import RegistrationState, StageView
 from fgreg.live.recorder import RecorderState
 from fgreg.live.status import Figures, Status
+from fgreg.live.viewer_feed import RerunFeed
 from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.time_sync import Stamp
@@ -25,10 +26,12 @@ from fgreg.online.estimate import OnlineEstimate
 from fgreg.viewer import shapes
 from fgreg.viewer.endoscope_view import PATH, REFUSED
 from fgreg.viewer.live import ViewerUpdate
+from fgreg.viewer.null_viewer import NullViewer
 from fgreg.viewer.picture_ring import PictureRing
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.shapes import CANVAS, canvas
 from fgreg.viewer.status_line import Now
+from tests.overlay_status import room_status
 from tests.recordings import Row, read_recording, transform_of, views, views_of
 from tests.test_viewer_recording import make_model
 
@@ -245,3 +248,20 @@ def test_pictures_of_any_size_and_kind_are_shown_on_one_canvas() -> None:
     colour[..., 2] = 9
     np.testing.assert_array_equal(canvas(colour)[:400, :300], colour[::3, ::3])
     assert not canvas(colour)[400:].any()
+
+
+@pytest.mark.parametrize("registered", [False, True])
+def test_the_viewer_names_a_slow_machine_as_a_cause(registered: bool) -> None:
+    room, updates = room_status(rendered=False), list[ViewerUpdate]()
+
+    class Shown(NullViewer):
+        def update(self, update: ViewerUpdate) -> None:
+            updates.append(update)
+
+    feed = RerunFeed(Shown())
+    feed.session(room.model, 3.0)
+    recorder = RecorderState(RegistrationState(), room.estimate if registered else None)
+    feed.status(room.at(host_now(), recorder=recorder, slow="this machine is slow"))
+    feed.close()
+    assert all(update.reasons[0] == "this machine is slow" for update in updates)
+    assert updates

@@ -163,7 +163,8 @@ class RerunFeed(ViewerFeed):
         from fgreg.viewer.live import ViewerUpdate  # loads Rerun
 
         estimate, number, status, model = drawing.estimate, self._number, drawing.status, self._model
-        invalid = "" if status is None else status.invalid
+        invalid, slow = ("", "") if status is None else (status.invalid, status.slow)
+        reasons = () if estimate is None else (invalid, *estimate.reasons)
         if model is None:
             raise AssertionError("the session comes first")
         self._number += 1
@@ -186,7 +187,7 @@ class RerunFeed(ViewerFeed):
                 marker_T_laser=self._beam,
                 tre=None if estimate is None or invalid else estimate.predicted_tre,
                 verdict=Verdict.REFUSED if estimate is None or invalid else estimate.verdict,
-                reasons=() if estimate is None else tuple(filter(None, (invalid, *estimate.reasons))),
+                reasons=tuple(filter(None, (slow, *reasons))),
                 pairs=0 if estimate is None else estimate.pairs,
                 nis=estimate.nis if estimate is not None and isinstance(drawing.shot, Pair) else None,
                 used=estimate is not None and estimate.used,
