@@ -334,10 +334,9 @@ def refusing_moves(stand: Stand, monkeypatch: pytest.MonkeyPatch, error: FgregEr
 def test_a_move_that_the_disk_refuses_holds_until_it_is_recorded(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     full = refusing_moves(stand, monkeypatch, JournalError("events.jsonl", "no space left", "room for events"))
     stand.base_T_camera = MOVED
-    stand.turn(1.5)
+    stand.turn(10.0, lambda: "no space left" in stand.recorder.state.trouble)
     assert stand.recorder.state.camera_moving
     assert stand.link.beats[-1] is None
-    assert "no space left" in stand.recorder.state.trouble
     full[0] = False
     stand.turn(10.0, lambda: not stand.recorder.state.camera_moving)
     (move,) = stand.moves()
@@ -349,7 +348,7 @@ def test_a_move_that_is_not_taken_in_invalidates_and_the_next_one_gives_no_motio
 ) -> None:
     refuses = refusing_moves(stand, monkeypatch, EventRefused("of no use"))
     stand.base_T_camera = MOVED
-    stand.turn(1.5)
+    stand.turn(10.0, lambda: stand.recorder.state.refused > 0)
     assert stand.recorder.state.camera_moving
     assert stand.link.beats[-1] is None
     refuses[0] = False
