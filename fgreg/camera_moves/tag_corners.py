@@ -39,12 +39,14 @@ class TagCorners:
         self._at.clear()
 
     def at_rest(self, views: Sequence[Mapping[int, FloatArray]]) -> bool | None:
-        """Whether the tags are where they were; None while no place at rest is known of those that are seen.
+        """Whether the tags are where they were; None where that cannot be told.
+
+        So it is while no place at rest is known of those that are seen, and where of two one has moved.
 
         Args:
             views: of either camera: corners (4, 2) px of the static tags in a frame, by tag.
 
-        Of several tags the middle one counts, so that one that is touched is no camera move; of two the farther one.
+        Of several tags the middle one counts, so that one that is touched, or covered in part, is no camera move.
         """
         centres = {(view, tag): at.mean(axis=0) for view, seen in enumerate(views) for tag, at in seen.items()}
         known = {key: place for key, (place, count) in self._at.items() if count >= FIRST_FRAMES}
@@ -52,8 +54,11 @@ class TagCorners:
         for view, tag in centres.keys() & known.keys():
             shift = float(np.linalg.norm(centres[view, tag] - known[view, tag]))
             shifts[tag] = max(shifts.get(tag, 0.0), shift / self._limit_px[view])
-        if shifts and sorted(shifts.values())[len(shifts) // 2] > 1.0:
+        away = sum(shift > 1.0 for shift in shifts.values())
+        if 2 * away > len(shifts):
             return False
+        if away and 2 * away == len(shifts):
+            return None
         if known and not shifts:  # the camera may have moved: others are not learnt where they are now
             return None
         for key, centre in centres.items():
