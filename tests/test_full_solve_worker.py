@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from fgreg.model.estimate import Verdict
+from fgreg.model.estimate import CertificateEstimate, Verdict
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -20,6 +20,9 @@ from fgreg.online.engine import OnlineRegistration
 from fgreg.online.events import CameraMoved
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult
 from fgreg.online.solver import InProcessSolver, WorkerSolver
+from fgreg.registration import solve as batch_solve
+from fgreg.registration.proof import Proof
+from fgreg.registration.verdict import Condition
 from fgreg.workers.worker_process import WorkerProcess
 from tests.forward import make_measurements
 from tests.online_streams import batch, first, restored, run, sigmas_apart
@@ -169,3 +172,75 @@ def test_a_result_about_pairs_that_are_of_other_epochs_by_now_is_dropped(
     assert estimate.epoch == 1
     assert estimate.pairs <= 3
     assert engine.state.epochs[0].state is not None
+
+
+# --- proofs -----------------------------------------------------------------------------------------------------------
+
+PROVING = SolveConfig(certificate_budget=200_000)
+PROVED, OTHER = "no other registration explains these pairs", "another registration explains the pairs as well"
+
+
+@pytest.fixture
+def proving(case: tuple[SessionModel, Measurements]) -> tuple[OnlineRegistration, Late]:
+    """With the proofs of the full solves given when they are released."""
+    engine, prover = OnlineRegistration(case[0], PROVING, find_moves=False), Late(case[0], PROVING, verdicts=True)
+    engine._proofs._solver = prover
+    return restored(engine, first(case[1], PAIRS)), prover
+
+
+def test_a_proof_is_reported_when_it_is_there_and_nothing_waits_for_it(
+    case: tuple[SessionModel, Measurements], proving: tuple[OnlineRegistration, Late]
+) -> None:
+    engine, prover = proving
+    before = engine.estimate
+    assert prover.busy
+    assert before.settled
+    assert PROVED not in " ".join(before.reasons)
+    prover.released = True
+    after = engine.refresh()
+    assert (after.verdict, after.settled) == (before.verdict, True)
+    assert PROVED in " ".join(after.reasons)
+    assert not prover.busy
+    prover.failure = "the proof's process has ended"
+    assert "not certified: the proof's process has ended" in engine.refresh().reasons
+    assert engine.estimate.verdict is before.verdict
+    engine.add(case[1].pairs[PAIRS])
+    assert prover.busy  # the next full solve's
+    assert PROVED not in " ".join(engine.estimate.reasons)
+
+
+def test_a_registration_that_a_proof_refuses_stays_refused_until_the_next_proof(
+    case: tuple[SessionModel, Measurements],
+    proving: tuple[OnlineRegistration, Late],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    engine, prover = proving
+    found = CertificateEstimate(False, 0.0, 9.2, None, None, np.eye(4), OTHER)
+    proof = Proof(found, (Condition(Verdict.REFUSED, OTHER),))
+    monkeypatch.setattr(batch_solve, "prove", lambda *_: proof)
+    engine.add(case[1].pairs[PAIRS])  # while the one before is being proved, which ends in vain
+    for _ in range(3):
+        prover.released = True
+        estimate = engine.refresh()
+    assert not prover.busy
+    assert (estimate.verdict, estimate.reasons.count(OTHER)) == (Verdict.REFUSED, 1)
+    monkeypatch.undo()
+    for pair in case[1].pairs[PAIRS + 1 :]:
+        estimate = engine.add(pair)
+        assert (estimate.verdict, estimate.reasons.count(OTHER)) == (Verdict.REFUSED, 1)
+    assert prover.busy
+    for _ in range(3):
+        prover.released = True
+        estimate = engine.refresh()
+    assert estimate.verdict is not Verdict.REFUSED
+    assert OTHER not in estimate.reasons
+    assert PROVED in " ".join(estimate.reasons)
+
+
+def test_what_is_proved_of_pairs_that_are_of_other_epochs_by_now_does_not_count(
+    case: tuple[SessionModel, Measurements], proving: tuple[OnlineRegistration, Late]
+) -> None:
+    engine, prover = proving
+    engine.add(CameraMoved(case[1].pairs[PAIRS].t - 0.01))
+    prover.released = True
+    assert PROVED not in " ".join(engine.refresh().reasons)

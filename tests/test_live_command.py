@@ -87,7 +87,7 @@ def wait_for_word(process: subprocess.Popen[str], text: str) -> None:
 @pytest.mark.parametrize("phase", ["starting the registration", "opening the devices", "aim at corner", "ending"])
 def test_ctrl_c_in_any_phase_leaves_a_session_and_no_process(tmp_path: Path, phase: str) -> None:
     folder = tmp_path / "session"
-    process = start(folder, "--aims", "3", "--bump-every", "inf")
+    process = start(folder, "--aims", "3", "--bump-every", "inf", "--certify")
     if phase == "ending":  # it is interrupted twice: the second time while all of it is solved, or just before
         wait_for(folder, '"aim"', process)
         process.send_signal(signal.SIGINT)

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -87,6 +88,13 @@ def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBa
             ),
         ] = 640,
         limit_mm: LimitOption = 3.0,
+        certify: Annotated[
+            bool,
+            typer.Option(
+                "--certify",
+                help="Prove after each full solve that no other registration explains the pairs; nothing waits for it.",
+            ),
+        ] = False,
         example_config: Annotated[
             bool, typer.Option("--example-config", help="Print a CONFIG.yaml with every driver and key, explained.")
         ] = False,
@@ -131,7 +139,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBa
             raise InputError("--duration", str(duration), "seconds > 0")
         if config is not None:
             _alone(context)
-        settings = solve_config(limit_mm, "")
+        settings = solve_config(limit_mm, "", certify=certify)
         folder = default_folder() if out is None else out
         silent = as_json or quiet
         result = folder / RESULT_FILE if folder.is_dir() else None
@@ -143,7 +151,8 @@ def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBa
             if config is None:
                 setup = _room(stack, seed, aims, bumps, width, static_tags, seen=seen)
             else:
-                setup, settings = _configured(stack, config, display, seen=seen)
+                setup, found = _configured(stack, config, display, seen=seen)
+                settings = replace(found, certificate_budget=settings.certificate_budget)
             figures = _conduct(setup, folder, settings, duration, rrd, display, viewer=viewer)
         with progress_bar(silent) as progress:
             report = solve_session(SolveRequest(folder, None, None), settings, progress)

@@ -36,6 +36,7 @@ from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, other_start, result_of
 from fgreg.online.next_state import next_state
 from fgreg.online.noticed_moves import NoticedMoves
+from fgreg.online.proofs import Proofs
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
@@ -109,11 +110,13 @@ class OnlineRegistration:
         self._surface: TissueSurface | None = None
         self._find_moves, self._verdicts = find_moves, verdicts
         self._move_failure = ""  # of the camera-move test
-        self._failures = ("", "")  # as reported in the estimate
+        self._failures = ("", "", "")  # as reported in the estimate
         self._losses = 0  # cases lost in a row
         self._tags = TagMonitor()
         self._noticed = NoticedMoves()
         self._solver = make_solver(full_solve, model, self._config, verdicts=verdicts)
+        self._proofs = Proofs(full_solve, model, self._config)
+        self._submitted: FullSolveCase | None = None
         self._estimate = self._estimated(self._state, 0.0)
 
     def __enter__(self) -> OnlineRegistration:
@@ -123,8 +126,9 @@ class OnlineRegistration:
         self.close()
 
     def close(self) -> None:
-        """End the worker process, if there is one; the estimate stays."""
+        """End the worker processes, if there are any; the estimate stays."""
         self._solver.close()
+        self._proofs.close()
 
     # --- events -----------------------------------------------------------------------------------------------------
 
@@ -183,6 +187,7 @@ class OnlineRegistration:
     def _divided(self, *, by_tags: bool = False) -> None:
         """Note that the division of the pairs into epochs has changed: results of earlier cases are invalid."""
         self._division += 1
+        self._proofs.forget()
         self._misplaced, self._finished_prior = frozenset(), None
         if self._state.epoch_pairs:  # the epoch before has other pairs now
             self._solved = min(self._solved, self._state.epoch - 1)
@@ -221,13 +226,15 @@ class OnlineRegistration:
                     break
                 self._asked, self._solve_wanted, self._move_wanted = self._division, False, False
                 self._move_untested = case.move is not None and case.move.known is None
+                self._submitted = case
                 self._solver.submit(case)
                 if self._solver.busy and case.measurements is not None and self._state.active_window is None:
                     self._state = replace(self._state, why_none="its pairs are being registered")
                     self._estimate = self._estimated(self._state, self._estimate.t)
             if not self._fetch(t):
                 break
-        failures = (self._solver.failure, self._move_failure)
+        self._take_proof()
+        failures = (self._solver.failure, self._move_failure, self._proofs.failure)
         if failures != self._failures:
             self._failures = failures
             self._estimate = self._estimated(self._state, self._estimate.t)
@@ -264,6 +271,8 @@ class OnlineRegistration:
             self._close_loop(found.move, t)
         else:
             self._take_over(found)
+            if self._submitted is not None and found.initial is not None and self._report is found.report:
+                self._proofs.want(self._submitted)
         return True
 
     def _case(self) -> FullSolveCase | None:
@@ -341,6 +350,14 @@ class OnlineRegistration:
             self._solver.failure = f"{type(error).__name__}: {error}"
             self._estimate = self._estimated(self._state, self._estimate.t)
 
+    def _take_proof(self) -> None:
+        """Take over what was proved since of the last full solve's registration."""
+        refusal, report = self._proofs.refusal, self._proofs.fetch(self._report)
+        if report is not None and report.epoch == self._state.epoch:
+            self._report, self._reports = report, report.epochs
+        if report is not None or self._proofs.refusal != refusal:
+            self._estimate = self._estimated(self._state, self._estimate.t)
+
     def _reassign(self, found: CameraMove, t: float) -> None:
         """Begin a new epoch at the first pair after an unreported camera move."""
         before = self._state
@@ -381,6 +398,7 @@ class OnlineRegistration:
         self._state, self._estimate = state, estimate
         self._serial += 1
         self._division += 1
+        self._proofs.forget()
         self._solve_wanted = True
 
     def _note_move(
@@ -421,6 +439,8 @@ class OnlineRegistration:
             found = full_solve(case, self._model, self._config, verdicts=self._verdicts)
             if found.begins is None:
                 self._take_over(found)
+                if found.initial is not None:
+                    self._proofs.want(case)
                 break
             self._begin_again(found.begins)
 
@@ -488,6 +508,7 @@ class OnlineRegistration:
             self._begin_again(begins)
         self._solver.failure = ""
         self._solve_wanted = False
+        self._proofs.forget()
         self._take_over(result_of(case, measurements, solution))
         return solution
 
@@ -519,8 +540,14 @@ class OnlineRegistration:
             known.append(f"the full solve failed: {self._solver.failure}: its earlier result may be out of date")
         if self._move_failure:
             known.append(f"camera moves are not looked for: {self._move_failure}")
+        refusal, failure = self._proofs.refusal, self._proofs.failure
         texts = tuple(text for text in known if text)
+        verdict = Verdict.WARNING if texts else Verdict.OK
+        if refusal and refusal not in estimate.reasons:  # of fewer pairs
+            texts, verdict = (refusal, *texts), Verdict.REFUSED
+        if failure:
+            texts = (*texts, f"not certified: {failure}")
         if not texts:
             return estimate
-        verdict = max(estimate.verdict, Verdict.WARNING, key=lambda v: v.severity)
+        verdict = max(estimate.verdict, verdict, key=lambda v: v.severity)
         return replace(estimate, verdict=verdict, reasons=(*texts, *estimate.reasons))

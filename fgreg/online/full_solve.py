@@ -49,6 +49,7 @@ class FullSolveCase:
         draft: whether to leave posterior and verdict out where the registration moved away from where ``finished`` was
             linearised: that is linearised and the case solved again.
         searched: minima of the current epoch from a draft on the same measurements; they do not depend on ``finished``.
+        certify: whether to prove the registration as well, where the configuration asks for proofs.
     """
 
     serial: int
@@ -62,6 +63,7 @@ class FullSolveCase:
     detected: bool = False
     draft: bool = False
     searched: EpochSearch | None = None
+    certify: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +143,8 @@ def full_solve(
     ``verdicts``: False leaves posterior and verdict out.
     """
     failure = None
+    if not case.certify:
+        config = replace(config, certificate_budget=0)
     if case.move is not None:
         failure = ""
         try:

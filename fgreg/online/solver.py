@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, full_solve
-from fgreg.workers.worker_process import Work, WorkerProcess
+from fgreg.workers.worker_process import NICENESS, Work, WorkerProcess
 
 Where = Literal["in_process", "worker"]
 
@@ -63,11 +63,21 @@ class InProcessSolver:
 
 
 class WorkerSolver:
-    """Solves in a worker process."""
+    """Solves in a worker process; ``name`` and ``what``: of it, as in messages, ``niceness``: added to the owner's."""
 
-    def __init__(self, model: SessionModel, config: SolveConfig, *, verdicts: bool) -> None:
+    def __init__(
+        self,
+        model: SessionModel,
+        config: SolveConfig,
+        *,
+        verdicts: bool,
+        name: str = "fgreg-solve",
+        what: str = "the full solve's process",
+        niceness: int = NICENESS,
+    ) -> None:
+        self._what = what
         self._worker: WorkerProcess[FullSolveCase, FullSolveResult] = WorkerProcess(
-            _work, model, config, verdicts, name="fgreg-solve", what="the full solve's process"
+            _work, model, config, verdicts, name=name, what=what, niceness=niceness
         )
 
     @property
@@ -79,7 +89,7 @@ class WorkerSolver:
     def failure(self) -> str:
         """Why the last case failed; empty where it did not."""
         waits = self._worker.busy and self._worker.trouble  # the process does not take the case
-        return f"the full solve's process: {self._worker.trouble}" if waits else self._worker.failure
+        return f"{self._what}: {self._worker.trouble}" if waits else self._worker.failure
 
     @failure.setter
     def failure(self, text: str) -> None:
@@ -123,3 +133,11 @@ def make_solver(where: Where, model: SessionModel, config: SolveConfig, *, verdi
     if where == "worker":
         return WorkerSolver(model, config, verdicts=verdicts)
     raise ValueError(f"full_solve is {where!r}, expected 'in_process' or 'worker'")
+
+
+def make_prover(where: Where, model: SessionModel, config: SolveConfig) -> Solver:
+    """As :func:`make_solver`, for the proofs that follow full solves: it gives way to these."""
+    if where == "worker":
+        what, niceness = "the proof's process", 2 * NICENESS
+        return WorkerSolver(model, config, verdicts=True, name="fgreg-proof", what=what, niceness=niceness)
+    return make_solver(where, model, config, verdicts=True)

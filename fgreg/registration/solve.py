@@ -166,7 +166,8 @@ def solve(
         zip(labels_and_inliers(registration, measurements)[0], (p.pm for p in measurements.pairs), strict=True)
     )
     steady = {k: steadiness(registration, place, config.limit_mm, names) for place, k in enumerate(registration.epochs)}
-    proofs = {k: proof for k in registration.epochs if (proof := prove(registration, k, config)) is not None}
+    to_prove = [k for k in registration.epochs if k not in (known or {})]
+    proofs = {k: proof for k in to_prove if (proof := prove(registration, k, config)) is not None}
     for k, proof in proofs.items():
         steady[k].extend(proof.conditions)
     reports = epoch_verdicts(measurements, centred, posterior, budget, pairs, model, config, common, steady, before)
