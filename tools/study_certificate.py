@@ -1,17 +1,18 @@
 """The certificate (fgreg.certificate) on simulated sessions: what it proves, the gap it reaches, how long it takes.
 
     python tools/study_certificate.py --sessions 100         # rows of sessions: first hit and window only
-    python tools/study_certificate.py --scenes 1000          # every minimum of a scene, against the best known one
+    python tools/study_certificate.py --scenes 1000          # the minima of scenes, against the best known one
 
 Rows: 12 aims, noise as published or as detected frames leave it, the rig as uncertain as declared. Good sessions
 count: one minimum, no outlier. Printed, of these: the share whose gap is at most 1e-3 and 1e-2, the share for which
 others within 9.2 of chi square are excluded beyond the angle and shift shown (medians), the share certified, and the
 certificate's processor time (of its thread).
 
-Scenes: 4 to 8 pairs, first hit or window only, noise as published. The best known minimum is the best of the
-multi-start search and of ``--starts`` random registrations, by local searches on the whole graph. Each distinct
-minimum (of the best four) is handed to the certificate as if it were the estimate. Wrong: a certificate on a minimum
-that is more than 1e-3 above the best known. Ambiguous: another minimum is within 9.2 of the best known.
+Scenes: 4 to 8 pairs, first hit or (every fourth) window only, noise as published. The best known minimum is the best of
+the multi-start search and of ``--starts`` random registrations, by local searches on the whole graph. Each of the best
+four distinct minima is handed to the certificate as if it were the estimate. Wrong: a certificate on a minimum that is
+more than 1e-3 above the best known. Ambiguous: another minimum is within 9.2 of the best known. Each scene is one line,
+and their sum is printed at the end, or at Ctrl-C (``timeout -s INT 3600 python ...``): of as many as were done.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 
@@ -47,6 +49,7 @@ from fgreg.simulation.config import Sweep
 from fgreg.simulation.presets import FIRST_HIT
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
+from study_pool import add_pool_options, pool_of
 from systematic_cells import NOISES
 
 ROWS = [(sweep, noise, pairs) for sweep in ("first hit", "window") for noise in NOISES for pairs in (6, 10, 15, 25)]
@@ -54,6 +57,10 @@ CONFIG = SolveConfig()
 SAME_COST = 1e-3
 BATCH = 100
 MOST_MINIMA = 4
+ENDED = 16
+"""Best of the local searches' ends that are searched on to their minima."""
+Task = tuple[str, str, int, int]
+"""Sweep, noise, pairs, seed."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +72,22 @@ class Shown:
     time_s: float
 
 
-def session(sweep: str, noise: NoiseModel, pairs: int, seed: int, folder: Path) -> Registration | None:
-    """A simulated session, registered; None where it is not good."""
+def session(sweep: str, noise: NoiseModel, pairs: int, seed: int) -> Registration | None:
+    """A simulated session, registered; None where it has no registration."""
     way = Sweep.WINDOW if sweep == "window" else Sweep.ALTERNATING
     config = replace(FIRST_HIT, pairs=pairs, noise=noise, sweep=way, tracks_heard=0, tracks_silent=0)
-    path = folder / f"{seed}"
-    write_session(simulate(config, seed), path)
-    read = read_session(path)
+    with tempfile.TemporaryDirectory() as folder:
+        write_session(simulate(config, seed), Path(folder) / "session")
+        read = read_session(Path(folder) / "session")
     try:
         return register(extract_measurements(read.events, read.model).measurements, read.model, CONFIG)
     except EstimationError:
         return None
+
+
+def is_good(found: Registration | None) -> TypeGuard[Registration]:
+    """Whether a session has one minimum and no outlier."""
+    return found is not None and not found.ambiguous and found.searches[0].clean and bool(found.shots.pm_inlier.all())
 
 
 def shown(found: Registration, budget: int) -> Shown:
@@ -89,20 +101,21 @@ def shown(found: Registration, budget: int) -> Shown:
     if certificate is not None:
         others = other_minima(found, 0, certificate.starts, CONFIG)
         certified = certificate.is_least and certificate.is_alone and certificate.holds_without_pairs and not others
-    return Shown(certificate, certified, time.process_time() - begin)
+    return Shown(certificate, bool(certified), time.process_time() - begin)
 
 
-def row(sweep: str, noise: str, pairs: int, count: int, seed: int, budget: int, folder: Path) -> dict[str, object]:
+def good_session(task: Task, budget: int) -> Shown | None:
+    """The certificate of a session; None where it is not good."""
+    sweep, noise, pairs, seed = task
+    found = session(sweep, NOISES[noise], pairs, seed)
+    return shown(found, budget) if is_good(found) else None
+
+
+def row(tasks: Sequence[Task], found: Iterable[Shown | None]) -> dict[str, object]:
     """The figures of one kind of session."""
-    results, gone = [], 0
-    for index in range(count):
-        found = session(sweep, NOISES[noise], pairs, seed + index, folder / f"{sweep}-{noise}-{pairs}")
-        if found is None or found.ambiguous or not found.searches[0].clean or not found.shots.pm_inlier.all():
-            gone += 1
-            continue
-        results.append(shown(found, budget))
-        print(f"\r{sweep}, {noise}, {pairs} pairs: {index + 1} of {count}", end="", file=sys.stderr)
-    print(file=sys.stderr)
+    (sweep, noise, pairs, _), every = tasks[0], list(found)
+    results = [result for result in every if result is not None]
+    gone = len(every) - len(results)
     there = [result.certificate for result in results if result.certificate is not None]
     alone = [c for c in there if c.is_alone]
     times = sorted(result.time_s for result in results)
@@ -154,76 +167,113 @@ def _random_turns(count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def distinct_minima(found: Registration, optima: Sequence[Optimum]) -> list[Optimum]:
-    """The ``MOST_MINIMA`` best minima, no two with nearly the same registration; the others were dropped on the way."""
-    each = [(float(cost), o.state.take([i])) for o in optima for i, cost in enumerate(o.evaluation.cost)]
-    out: list[Optimum] = []
+    """The ``MOST_MINIMA`` best minima, no two with nearly the same registration."""
+    targets = found.model.targets_mm
 
-    def is_new(optimum_or_start: Optimum | SharedState) -> bool:
-        state = optimum_or_start if isinstance(optimum_or_start, SharedState) else optimum_or_start.state
-        pose, targets = state.trus_T_camera()[0], found.model.targets_mm
-        return all(targets_moved(other.state.trus_T_camera()[0], pose, targets) > SAME_MINIMUM_MM for other in out)
+    def distinct(costs: FloatArray, state: SharedState, most: int) -> list[int]:
+        poses, out = state.trus_T_camera(), list[int]()
+        for index in np.argsort(costs).tolist():
+            if len(out) == most or not np.isfinite(costs[index]):
+                break
+            if all(targets_moved(poses[other], poses[index], targets) > SAME_MINIMUM_MM for other in out):
+                out.append(index)
+        return out
 
-    for _, state in sorted((one for one in each if np.isfinite(one[0])), key=lambda one: one[0]):
-        if is_new(state):
-            ended = optimize(found.problem, state)  # those far above the best were stopped on their way
-            if ended.converged.all() and is_new(ended):
-                out.append(ended)
-        if len(out) == MOST_MINIMA:
-            break
-    return sorted(out, key=lambda one: float(one.evaluation.cost[0]))
+    names = SharedState.__slots__
+    state = SharedState(*(np.concatenate([getattr(one.state, name) for one in optima]) for name in names))
+    chosen = distinct(np.concatenate([one.evaluation.cost for one in optima]), state, ENDED)
+    ended = optimize(found.problem, state.take(chosen))  # those far above the best were stopped on their way
+    costs = np.where(ended.converged, ended.evaluation.cost, np.inf)
+    return [ended.take(index) for index in distinct(costs, ended.state, MOST_MINIMA)]
 
 
-def scenes(count: int, starts: int, seed: int, budget: int, folder: Path) -> dict[str, object]:
-    """Certificates on every minimum of random scenes."""
+@dataclass(frozen=True)
+class Scene:
+    """Chi squares of a scene's minima, and whether each was certified; none where there is no scene."""
+
+    seed: int
+    sweep: str
+    pairs: int
+    costs: tuple[float, ...] = ()
+    certified: tuple[bool, ...] = ()
+    by_multistart: bool = False
+
+    @property
+    def ambiguous(self) -> bool:
+        return len(self.costs) > 1 and self.costs[1] - self.costs[0] < CONFIG.second_minimum_chi2
+
+    @property
+    def text(self) -> str:
+        if not self.costs:
+            return f"seed {self.seed}: no registration, or outliers"
+        pairs = zip(self.costs, self.certified, strict=True)
+        minima = ", ".join(f"{cost:.2f}{' certified' if certified else ''}" for cost, certified in pairs)
+        return f"seed {self.seed}: {self.sweep}, {self.pairs} pairs: {minima}{' (ambiguous)' if self.ambiguous else ''}"
+
+
+def scene(seed: int, starts: int, budget: int) -> Scene:
+    """Certificates on every minimum of a random scene."""
+    rng = np.random.default_rng(seed)
+    pairs, sweep = int(rng.integers(4, 9)), "window" if seed % 4 == 3 else "first hit"
+    found = session(sweep, NOISES["published"], pairs, seed)
+    if found is None or not found.shots.pm_inlier.all():
+        return Scene(seed, sweep, pairs)
+    minima = distinct_minima(found, [found.optimum, *random_minima(found, starts, rng)])
+    costs = tuple(float(one.evaluation.cost[0]) for one in minima)
+    certified = tuple(shown(replace(found, optimum=one), budget).certified for one in minima)
+    by_multistart = float(found.optimum.evaluation.cost[0]) <= costs[0] + SAME_COST
+    return Scene(seed, sweep, pairs, costs, certified, by_multistart)
+
+
+def scenes(found: Iterable[Scene]) -> dict[str, object]:
+    """Totals of scenes, each printed as it is done; of those before an interruption."""
     tally: Counter[str] = Counter()
-    wrong = []
-    for index in range(count):
-        rng = np.random.default_rng(seed + index)
-        pairs, sweep = int(rng.integers(4, 9)), "window" if index % 4 == 3 else "first hit"
-        found = session(sweep, NOISES["published"], pairs, seed + index, folder)
-        if found is None or not found.shots.pm_inlier.all():
-            tally["no registration, or outliers"] += 1
-            continue
-        minima = distinct_minima(found, [found.optimum, *random_minima(found, starts, rng)])
-        costs = [float(o.evaluation.cost[0]) for o in minima]
-        tally["scenes"] += 1
-        tally["best known is the multi-start's"] += float(found.optimum.evaluation.cost[0]) <= costs[0] + SAME_COST
-        ambiguous = len(costs) > 1 and costs[1] - costs[0] < CONFIG.second_minimum_chi2
-        tally["ambiguous"] += ambiguous
-        for optimum, cost in zip(minima, costs, strict=True):
-            of = shown(replace(found, optimum=optimum), budget)
-            tally["minima"] += 1
-            best = cost <= costs[0] + SAME_COST
-            if of.certified:
-                tally["certified, best known"] += best
-                tally["certified, wrong"] += not best
-                tally["certified, of ambiguous scenes"] += ambiguous
-                if not best or ambiguous:
-                    wrong.append({"seed": seed + index, "pairs": pairs, "sweep": sweep, "above": cost - costs[0]})
-        print(f"\rscenes: {index + 1} of {count}", end="", file=sys.stderr)
-    print(file=sys.stderr)
+    wrong: list[str] = []
+    try:
+        for one in found:
+            print(one.text, flush=True)
+            if not one.costs:
+                tally["no registration, or outliers"] += 1
+                continue
+            tally["scenes"] += 1
+            tally["minima"] += len(one.costs)
+            tally["best known is the multi-start's"] += one.by_multistart
+            tally["ambiguous"] += one.ambiguous
+            best = [cost <= one.costs[0] + SAME_COST for cost in one.costs]
+            tally["best and not ambiguous"] += 0 if one.ambiguous else sum(best)
+            for is_best, certified in zip(best, one.certified, strict=True):
+                tally["certified, best known"] += certified and is_best
+                tally["certified, wrong"] += certified and not is_best
+                tally["certified, of ambiguous scenes"] += certified and one.ambiguous
+            if any(one.certified) and (one.ambiguous or any(one.certified[1:])):
+                wrong.append(one.text)
+    except KeyboardInterrupt:
+        print("interrupted")
     return {**tally, "to_look_at": wrong}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=0, help="of each row (0: none)")
-    parser.add_argument("--scenes", type=int, default=0, help="with all their minima (0: none)")
+    parser.add_argument("--scenes", type=int, default=0, help="with their minima (0: none)")
     parser.add_argument("--starts", type=int, default=1000, help="random registrations of each scene")
     parser.add_argument("--pairs", type=int, nargs="*", default=(6, 10, 15, 25))
     parser.add_argument("--sweep", choices=("first hit", "window"), nargs="*", default=("first hit", "window"))
     parser.add_argument("--seed", type=int, default=1, help="of the first session; the others follow")
     parser.add_argument("--budget", type=int, default=CERTIFICATE_BUDGET)
     parser.add_argument("--json", action="store_true", help="print one JSON document at the end")
+    add_pool_options(parser)
     args = parser.parse_args()
     results: list[dict[str, object]] = []
-    with tempfile.TemporaryDirectory() as name:
+    with pool_of(args) as pool:
         for sweep, noise, pairs in ROWS if args.sessions else ():
             if sweep in args.sweep and pairs in args.pairs:
-                results.append(row(sweep, noise, pairs, args.sessions, args.seed, args.budget, Path(name)))
+                tasks = [(sweep, noise, pairs, args.seed + index) for index in range(args.sessions)]
+                results.append(row(tasks, pool.map(partial(good_session, budget=args.budget), tasks)))
                 print({key: round(v, 4) if isinstance(v, float) else v for key, v in results[-1].items()}, flush=True)
         if args.scenes:
-            results.append(scenes(args.scenes, args.starts, args.seed, args.budget, Path(name) / "scenes"))
+            work = partial(scene, starts=args.starts, budget=args.budget)
+            results.append(scenes(pool.map(work, range(args.seed, args.seed + args.scenes))))
             print(results[-1])
     if args.json:
         print(json.dumps(results))
