@@ -106,6 +106,7 @@ CASES: dict[str, dict[str, Any]] = {
     "three looks, one shot": {"pairs": 6, "looks_per_pm": 3, "share_marker": True, "tilt_rad": 0.03},
     "two looks, own shots": {"pairs": 6, "looks_per_pm": 2},
 }
+MORE = CASES | {"many sharp lines": {"pairs": 20, "first_hit": False, "noise_model": SHARP}}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -135,9 +136,9 @@ def _cells(count: int, rng: np.random.Generator) -> Reach:
     return Reach(about, np.where(rng.random(count) < 0.5, corner, np.maximum(0.6 * corner, about.max(axis=0))))
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_no_bound_of_a_cell_is_above_the_cost_of_a_registration_in_it(case: str) -> None:
-    of, rng, cells = _conditional(_registered(5, **CASES[case])), np.random.default_rng(1), 150
+@pytest.mark.parametrize(("case", "seed"), [*((case, 5) for case in MORE), ("sharp lines", 37)])
+def test_no_bound_of_a_cell_is_above_the_cost_of_a_registration_in_it(case: str, seed: int) -> None:
+    of, rng, cells = _conditional(_registered(seed, **MORE[case])), np.random.default_rng(1), 150
     for away in (0.0, 0.02, 0.1, 1.0):
         rotation = of.rotation @ exp_so3(away * rng.normal(size=3))
         shift, polar, cost = _best_fit(of, rotation, None)
@@ -199,7 +200,9 @@ def test_what_the_linearisation_leaves_is_within_its_bounds(case: str, part: flo
         assert (np.abs(gives) <= rest.offset * (1.0 + 1e-9) + 1e-12).all()
         miss -= np.einsum("mknb,knb->mnb", at.line[:, :3], gives)
         chi2 = np.square(miss).sum(axis=0) + np.einsum("inb,iknb,knb->nb", gives, at.looks.hessian, gives)
-        left = np.sqrt(np.square(np.sqrt(chi2) + np.sqrt(at.looks.error2)).sum(axis=0))
+        each = np.sqrt(chi2) + np.sqrt(at.looks.error2)
+        assert (each <= rest.own * (1.0 + 1e-9) + 1e-9).all()
+        left = np.sqrt(np.square(each).sum(axis=0))
         assert (left <= rest.error * (1.0 + 1e-9) + 1e-9).all()
         assert (left > 0.3 * rest.error).any()
 
@@ -238,6 +241,19 @@ def test_bounds_of_small_cells_come_near_the_cost() -> None:
     loss = cost - sharper.cost
     assert loss[1] < 0.2 * loss[0]  # of third order or better: an eighth of it or less
     assert loss[1] < 1e-3 * cost
+
+
+def test_pm_by_pm_many_windows_exclude_more_cells() -> None:
+    of, rng = _conditional(_registered(5, **MORE["many sharp lines"])), np.random.default_rng(2)
+    cost, away = cost_at(of), rng.normal(size=(100, 3))
+    away *= rng.uniform(0.02, 0.1, (100, 1)) / np.linalg.norm(away, axis=1, keepdims=True)
+    centres = np.stack([of.rotation @ exp_so3(turn) for turn in away], axis=-1)
+    first, reach = first_intervals(of, cost), Reach.ball(np.full(100, np.radians(1.0)))
+    assert first is not None
+    intervals = Intervals(*(np.repeat(values, 100, axis=-1) for values in (first.centre, first.half)))
+    together, one_by_one = (narrowed(of, centres, reach, intervals, cost, thorough=way) for way in (False, True))
+    assert together.possible[one_by_one.possible].all()
+    assert one_by_one.possible.sum() < 0.7 * together.possible.sum()
 
 
 def _holding(cells: Cells, rotation: FloatArray) -> IntArray:

@@ -8,9 +8,17 @@ each PM's polar coordinates z, and L its linearisation,
 so (sqrt of that minimum - |e|)^2 is a lower bound, with e a bound on what the linearisation leaves. The minimum is that
 of a quadratic: z is eliminated PM by PM, then s, and good multipliers m are found for the 3 x 3 rest.
 
+One PM of which much is left spoils this for all. So it is taken PM by PM as well: for any 0 <= t_j <= 1,
+
+    |F_j|^2 >= (1 - t_j) |L_j|^2 - (1 / t_j - 1) e_j^2
+
+which is (|L_j| - e_j)^2 at t_j = e_j / |L_j|; a PM that may have no residual at all is left out (t_j = 1). The sum is
+a quadratic of the same kind, with weights.
+
 e needs bounds on z. Registrations with a larger cost than the ``threshold`` T are of no interest, and each PM's own
-terms say that its z lies in an interval. Given an e, |L| <= sqrt(T) + |e|, an ellipsoid that may narrow the intervals;
-they are handed on to the parts of a cell. All of it holds for every s, so no translation is left out.
+terms say that its z lies in an interval. Given an e, |L| <= sqrt(T) + |e|, an ellipsoid that may narrow the intervals,
+and so may |L_j| <= sqrt(T) + e_j, with theta and s in the ellipsoid; they are handed on to the parts of a cell. All of
+it holds for every s, so no translation is left out.
 
 What is left of a PM's place y, with sup over the intervals (half widths w, rho the largest range):
 
@@ -44,6 +52,10 @@ from fgreg.model.sensitivity import arc_of_rotation
 _SAFE = 1e-11
 SHARE = 0.15
 """Share of the quadratic's growth that pays for what the linearisation leaves, in the sharper bound."""
+LEAST_SIZES = (2.0, 0.5)
+"""Least |L_j| that the t_j are for, in shares of root of T / J, one after the other."""
+LEAST_SHARE, LEAST_WEIGHT = 0.005, 1e-4
+"""Of the t_j, and of the 1 - t_j: with no weight at all the sum would have no minimum that doubles can tell."""
 _ANYWHERE_MM = 1e9
 _LEAST_RANGE_MM = 1e-6
 
@@ -130,23 +142,99 @@ def first_intervals(of: Conditional, threshold: float) -> Intervals | None:
     return Intervals(centre[..., None], half[..., None])
 
 
-def lower_bounds(of: Conditional, rotation: FloatArray, reach: Reach, known: Intervals, threshold: float) -> Bounds:
-    """Bounds of cells with centres ``rotation`` (3, 3, B), given ``known`` intervals."""
+def lower_bounds(
+    of: Conditional,
+    rotation: FloatArray,
+    reach: Reach,
+    known: Intervals,
+    threshold: float,
+    *,
+    pm_by_pm: bool = False,
+) -> Bounds:
+    """Bounds of cells with centres ``rotation`` (3, 3, B), given ``known`` intervals.
+
+    ``pm_by_pm``: with what is left of each PM weighed by itself as well; takes twice the time.
+    """
     z, half = known.centre, known.half
     at = linearised(of, rotation, z, half)
     within = np.sqrt(max(threshold - of.constant, 0.0))
     rest = remainder(of, at, z, half, reach, within, 0.25)
-    line = at.line
-    line[:, 9] += np.einsum("mknb,knb->mnb", at.rows, middle(at, rest, reach))
+    line, about = at.line, np.einsum("ijb,j->ib", rotation, of.shift)  # about the estimate's s: sums of it would round
+    line[:, 9] += np.einsum("mknb,knb->mnb", at.rows, middle(at, rest, reach) - about[:, None])
     pull = np.einsum("minb,mjnb->ijnb", line[:, :3], line[:, 3:])
     pull[:, 6] += at.looks.gradient
     normal = np.einsum("minb,mjnb->ijb", line[:, 3:], line[:, 3:])
     normal[6, 6] += at.looks.chi2.sum(axis=0)
     found = minimum(at.hessian, at.spread, pull, normal, reach)
-    cost = np.maximum(np.sqrt(np.maximum(found.least - _SAFE * normal[6, 6], 0.0)) - rest.error, 0.0) ** 2
-    slack = (within + rest.error) ** 2 - found.least
+    least = found.least - _SAFE * normal[6, 6]
+    cost = np.maximum(np.sqrt(np.maximum(least, 0.0)) - rest.error, 0.0) ** 2
+    slack = (within + rest.error) ** 2 - least
     worth = np.sqrt(np.maximum(found.information, 0.0)) + rest.each / reach.about
-    return _narrowed(found, cost + of.constant, slack, known, rest.offset, worth, threshold)
+    out = _narrowed(found, cost + of.constant, slack, known, rest.offset, worth, threshold)
+    index = np.flatnonzero(out.possible)
+    if pm_by_pm and len(index):
+        parts = _Parts(
+            line[:, 3:], pull, at.hessian, at.spread, at.looks.chi2, rest.own, rest.offset, z, half
+        ).take(index)  # fmt: skip
+        solution = found.solution[:, index]
+        out.put(index, _pm_by_pm(parts, solution, reach.take(index), out.take(index), within, of.constant))
+    return replace(out, shift=out.shift + about, centre_shift=out.centre_shift + about)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """Of a linearisation: derivatives (m, 7, J, B) of the lines by theta, s, 1; ``pull`` (3, 7, J, B) of z with these;
+    ``hessian`` (3, 3, J, B) of z, ``spread`` its inverse; the looks' ``chi2`` (J, B); what is left of each PM, ``own``
+    (J, B), and ``offset`` (3, J, B) of its z; ``centre`` and ``half`` width of the intervals."""
+
+    line: FloatArray
+    pull: FloatArray
+    hessian: FloatArray
+    spread: FloatArray
+    chi2: FloatArray
+    own: FloatArray
+    offset: FloatArray
+    centre: FloatArray
+    half: FloatArray
+
+    def take(self, index: IntArray) -> _Parts:
+        return _Parts(*(getattr(self, name)[..., index] for name in self.__slots__))
+
+
+def _pm_by_pm(of: _Parts, solution: FloatArray, reach: Reach, out: Bounds, within: float, constant: float) -> Bounds:
+    """Bounds with what is left of each PM weighed by itself, from those with all of it at once.
+
+    Args:
+        of: the linearisation.
+        solution: (6, B) theta and s of its minimum.
+        reach, out: of the cells.
+        within: root of the threshold less the ``constant``.
+    """
+    about = Intervals(of.centre, of.half)
+    for least_size in LEAST_SIZES:
+        shared = np.concatenate([solution, np.ones((1, solution.shape[1]))])
+        residual = np.einsum("minb,ib->mnb", of.line, shared)
+        pull = np.einsum("kinb,ib->knb", of.pull, shared)
+        square = np.einsum("mnb,mnb->nb", residual, residual) + of.chi2
+        square -= np.einsum("knb,klnb,lnb->nb", pull, of.spread, pull)
+        size = np.maximum(np.sqrt(np.maximum(square, 0.0)), least_size * within / np.sqrt(len(square)))
+        share = np.clip(of.own / size, LEAST_SHARE, 1.0 - LEAST_WEIGHT)
+        weight = 1.0 - share
+        line = of.line * np.sqrt(weight)
+        normal = np.einsum("minb,mjnb->ijb", line, line)
+        normal[6, 6] += (weight * of.chi2).sum(axis=0)
+        found = minimum(of.hessian, of.spread, of.pull, normal, reach, weight)
+        loss = ((1.0 / share - 1.0) * of.own**2).sum(axis=0)
+        least = found.least - _SAFE * normal[6, 6] - loss
+        cost, slack, alone = np.fmax(out.cost, least + constant), within**2 - least, within + of.own
+        threshold, before = within**2 + constant, out.intervals
+        again = _narrowed(found, cost, slack, about, of.offset, out.worth, threshold, before, alone, weight)
+        solution = found.solution
+        smaller = np.einsum("iib->b", again.moved[:3, :3]) < np.einsum("iib->b", out.moved[:3, :3])
+        for name in ("turn", "shift", "moved", "centre_shift", "centre_fit"):
+            getattr(again, name)[..., ~smaller] = getattr(out, name)[..., ~smaller]
+        out = replace(again, possible=out.possible & again.possible)
+    return out
 
 
 def sharper_bounds(of: Conditional, rotation: FloatArray, reach: Reach, known: Bounds, threshold: float) -> Bounds:
@@ -203,8 +291,9 @@ def sharper_bounds(of: Conditional, rotation: FloatArray, reach: Reach, known: B
     normal[:3, :3] += 0.5 * (turned + turned.swapaxes(0, 1)) - np.eye(3)[..., None] * np.trace(turned)
     normal[6, 6] += looks.chi2.sum(axis=0)
     found = minimum(hessian, inverse(hessian), pull, normal, reach)
-    sharper = np.where(found.valid, found.least - loss - _SAFE * normal[6, 6] + of.constant, 0.0)
-    slack = threshold - of.constant - found.least + loss
+    least = found.least - loss - _SAFE * normal[6, 6]
+    sharper = np.where(found.valid, least + of.constant, 0.0)
+    slack = threshold - of.constant - least
     cost, about = np.maximum(known.cost, sharper), Intervals(z, half)
     out = _narrowed(found, cost, slack, about, rest.offset, known.worth, threshold, known.intervals)
     return replace(out, shift=out.shift + known.centre_shift, centre_shift=out.centre_shift + known.centre_shift)
@@ -219,11 +308,19 @@ def _narrowed(
     worth: FloatArray,
     threshold: float,
     before: Intervals | None = None,
+    alone: FloatArray | None = None,
+    weight: FloatArray | float = 1.0,
 ) -> Bounds:
-    """Bounds with the intervals of z narrowed to where the quadratic is at most ``slack`` above its minimum."""
-    before = before or about
-    far = np.sqrt(np.maximum(slack, 0.0) * np.maximum(found.variance, 0.0)) * (1.0 + _SAFE) + offset
-    far = np.where(found.valid, far, np.inf)
+    """Bounds with the intervals of z narrowed to where the quadratic is at most ``slack`` above its minimum.
+
+    ``alone`` (J, B): largest |L| of each PM, which bounds its z where theta and s are given. ``weight``: of the PMs.
+    """
+    before, slack = before or about, np.maximum(slack, 0.0)
+    shared, own = np.where(found.variance >= 0.0, slack * found.variance, np.inf), np.maximum(found.own, 0.0)
+    far = np.sqrt(shared + slack * own / np.maximum(weight, _SAFE))
+    if alone is not None:
+        far = np.minimum(far, np.sqrt(shared) + alone * np.sqrt(own))
+    far = np.where(found.valid, far * (1.0 + _SAFE) + offset, np.inf)
     middle = about.centre + np.where(found.valid, found.step, 0.0)
     # What is not a number excludes nothing.
     low, high = np.fmax(before.low, middle - far), np.fmin(before.high, middle + far)

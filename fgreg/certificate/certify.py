@@ -33,7 +33,7 @@ from fgreg.graph.shared_state import SharedState
 RELATIVE_GAP, LEAST_GAP = 1e-3, 1e-3
 """Gap up to which the minimum counts as proved: relative to the chi square, and at least as much of it (few pairs fit
 exactly, and differences as small are none)."""
-FINE_RAD = tuple(np.radians([3.0, 1.5]))
+FINE_RAD = tuple(np.radians([3.0, 1.5, 0.75]))
 """Cells that may hold another registration are halved to this; to the next one where they are not near enough else."""
 APART_RAD = tuple(np.radians([3.2, 1.6, 0.8]))
 """The same with the beam as it is without the pairs."""
@@ -126,7 +126,7 @@ def certify(
         epoch: place of the epoch.
         without_pairs: None where the beam is not known without the pairs.
         within_chi2: see :class:`Certificate`.
-        budget: number of cells times PMs to bound at most, in all searches (about 3 us each).
+        budget: number of cells times PMs to bound at most, in all searches (3 to 8 us each).
 
     Returns:
         None where a PM is nearer to the array than the array to its axis, which the bounds do not cover.

@@ -75,7 +75,7 @@ class Remainder:
     """What the linearisation leaves, at most, of registrations in cells and PMs within their intervals.
 
     Attributes:
-        error: (B,) root of the sum of squares, in standard deviations.
+        error: (B,) root of the sum of squares, in standard deviations. own: (J, B) of each PM.
         each: (3, B) part of it that grows with a cell's reach about each axis.
         offset: (3, J, B) by how much a PM's z and that of the linearised residuals differ.
         centred: (B,) whether the squares of the PMs' moves are about their middles, where these are in the residuals.
@@ -84,6 +84,7 @@ class Remainder:
     """
 
     error: FloatArray
+    own: FloatArray
     each: FloatArray
     offset: FloatArray
     centred: BoolArray
@@ -128,7 +129,8 @@ def remainder(
     unit = of.skew[:, None] * size
     crossed = np.stack([b * apart[2] + c * apart[1], a * apart[2] + c * apart[0], a * apart[1] + b * apart[0]])
     crossed += unit * moved
-    alone = np.sqrt(_weighed(at.left, crossed).sum(axis=0))
+    each_crossed = _weighed(at.left, crossed)
+    alone = np.sqrt(each_crossed.sum(axis=0))
     # By a mm of x, range and tangentially; then by a standard deviation of the first look.
     zero, slant = np.zeros_like(b), unit * np.sqrt(np.sqrt(np.square(at.left).sum(axis=(0, 1))))
     by_x, by_range, by_arc = (
@@ -148,12 +150,15 @@ def remainder(
     )
 
     def own(mm: FloatArray) -> FloatArray:
-        return np.asarray(np.sqrt(np.square(np.sqrt(_weighed(at.left, mm)) + np.sqrt(at.looks.error2)).sum(axis=0)))
+        return np.asarray(np.sqrt(_weighed(at.left, mm)) + np.sqrt(at.looks.error2))
+
+    def total(each: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.square(each).sum(axis=0)))
 
     # The bows: each PM's about its middle, or all of them in proportion to how far the PM is off, without a middle.
     bowed = place + np.stack([zero, 2.0 * part * bow, sideways])
     by_off = np.stack([zero, 0.5 * w * arc_sigma, w * plane_sigma + w**2 * arc_sigma / 6.0])
-    each_bowed, all_bowed = own(bowed), own(place) + np.sqrt(_weighed(at.left, by_off).max(axis=0)) * off
+    each_bowed, all_bowed = total(own(bowed)), total(own(place)) + np.sqrt(_weighed(at.left, by_off).max(axis=0)) * off
     centred = each_bowed <= all_bowed
     place += np.stack([zero, np.where(centred, 2.0 * part, 1.0) * bow, sideways])
     share = np.minimum(1.0, together / np.maximum(alone, 1e-300))
@@ -162,6 +167,7 @@ def remainder(
     by_tangent = c * c * (at.left[0, 0] * apart[1] ** 2 + at.left[1, 1] * apart[0] ** 2)
     return Remainder(
         error=np.minimum(each_bowed, all_bowed) + np.minimum(alone, together),
+        own=own(place) + np.sqrt(each_crossed),
         each=share * np.sqrt(np.stack([by_turn[0], by_tangent, by_turn[1]]).sum(axis=1)),
         offset=np.einsum("iknb,knb->inb", at.slide, place + crossed),
         centred=centred,

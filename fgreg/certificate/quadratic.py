@@ -21,8 +21,9 @@ _WEAKEST = 1e-6
 class Minimum:
     """The least value (B,) of a quadratic in (z, theta, s) with theta in a cell, from below, and what led to it.
 
-    ``solution`` (6, B) and ``covariance`` (6, 6, B) of (theta, s); ``step`` (3, J, B) and ``variance`` of z; of the
-    minimum with theta = 0: ``fixed_shift`` (3, B), ``fixed_step`` (3, J, B). ``valid`` (B,): whether it has a minimum.
+    ``solution`` (6, B) and ``covariance`` (6, 6, B) of (theta, s); ``step`` (3, J, B) of z, its ``variance`` that is
+    due to (theta, s), and its ``own`` with these given; of the minimum with theta = 0: ``fixed_shift`` (3, B),
+    ``fixed_step`` (3, J, B). ``valid`` (B,): whether it has a minimum.
     ``information`` (3, B): on theta about each axis.
     """
 
@@ -32,20 +33,29 @@ class Minimum:
     covariance: FloatArray
     step: FloatArray
     variance: FloatArray
+    own: FloatArray
     fixed_shift: FloatArray
     fixed_step: FloatArray
     information: FloatArray
 
 
-def minimum(hessian: FloatArray, spread: FloatArray, pull: FloatArray, normal: FloatArray, reach: Reach) -> Minimum:
+def minimum(
+    hessian: FloatArray,
+    spread: FloatArray,
+    pull: FloatArray,
+    normal: FloatArray,
+    reach: Reach,
+    weight: FloatArray | None = None,
+) -> Minimum:
     """Minimise a quadratic over theta within ``reach``, all z and s.
 
     Args:
         hessian: (3, 3, J, B) of z. spread: its inverse.
         pull: (3, 7, J, B) of z with (theta, s, 1). normal: (7, 7, B) of (theta, s, 1).
+        weight: (J, B) of the PMs' terms; it is in ``normal`` already.
     """
     gain = np.einsum("ijnb,jknb->iknb", spread, pull)
-    n = normal - np.einsum("kinb,kjnb->ijb", pull, gain)
+    n = normal - np.einsum("kinb,kjnb->ijb", pull if weight is None else pull * weight, gain)
     weak = _WEAKEST * np.trace(n[3:6, 3:6]) * _EYE
     valid = is_positive(hessian).all(axis=0) & is_positive(n[3:6, 3:6] - weak)
     n = np.where(valid, n, np.eye(7)[..., None])  # of those without a minimum nothing is used
@@ -60,14 +70,14 @@ def minimum(hessian: FloatArray, spread: FloatArray, pull: FloatArray, normal: F
     covariance[3:, 3:] = inner + np.einsum("ilb,lkb->ikb", lever, across[:3])
     solution = -np.einsum("ijb,jb->ib", covariance, n[:6, 6])
     shift = -across[6]
-    variance = np.einsum("iinb->inb", spread) + np.einsum("iknb,klb,ilnb->inb", gain[:, :6], covariance, gain[:, :6])
     return Minimum(
         least=np.where(valid, least, 0.0),
         valid=valid,
         solution=solution,
         covariance=covariance,
         step=-(gain[:, 6] + np.einsum("iknb,kb->inb", gain[:, :6], solution)),
-        variance=variance,
+        variance=np.einsum("iknb,klb,ilnb->inb", gain[:, :6], covariance, gain[:, :6]),
+        own=np.einsum("iinb->inb", spread),
         fixed_shift=shift,
         fixed_step=-(gain[:, 6] + np.einsum("iknb,kb->inb", gain[:, 3:6], shift)),
         information=np.where(valid, schur[[0, 1, 2], [0, 1, 2]], 0.0),

@@ -30,7 +30,7 @@ class SolveConfig:
         posterior_looks: with more looks than this the posterior is taken as the Gaussian at the optimum.
         seed: of those draws.
         certificate_budget: work at most for a proof that no other registration explains the pairs, as cells of
-            rotations times PMs (about 3 us each); 0: no proof.
+            rotations times PMs (3 to 8 us each); 0: no proof.
     """
 
     limit_mm: Annotated[
