@@ -78,6 +78,11 @@ class Intervals:
     def take(self, index: IntArray) -> Intervals:
         return Intervals(self.centre[..., index], self.half[..., index])
 
+    def within(self, other: Intervals) -> Intervals:
+        """The parts that are in the other ones."""
+        low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
+        return Intervals(0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-12))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounds:

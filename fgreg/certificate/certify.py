@@ -138,8 +138,8 @@ def certify(
     if others is None:
         return None
     few = others.finished and len(others.region.cells) <= FEW_CELLS
-    start = others.region if few else None
-    best = search(of, cost, reach_rad=0.0, budget=budget // 2, enough=enough, start=start)
+    start, spent = (others.region, others.looked_at) if few else (None, 0)
+    best = search(of, cost, reach_rad=0.0, budget=budget // 2, enough=enough, start=start, spent=spent)
     assert best is not None
     starts, looked_at, holds = [_starts(of, others, _turned(others))], best.looked_at + others.looked_at, False
     if without_pairs is not None:
@@ -172,7 +172,7 @@ def _narrowed_to(
     found: Found | None = None
     for reach_rad in fine:
         used, start = (0, None) if found is None else (found.looked_at, found.region)
-        more = search(of, threshold, reach_rad=reach_rad, budget=budget - used, start=start)
+        more = search(of, threshold, reach_rad=reach_rad, budget=budget - used, start=start, spent=used)
         if more is None:
             return None
         found = replace(more, looked_at=used + more.looked_at)

@@ -22,7 +22,7 @@ ROUNDS, ROUNDS_THOROUGH = 6, 15
 """Largest number of times that the intervals of a cell are narrowed before it is halved."""
 NARROWED, NARROWED_THOROUGH = 0.8, 0.96
 """Intervals that narrow to more than this part of what they were are not narrowed again."""
-EASY = 20_000
+EASY = 40_000
 """Cells times PMs up to which a search is not thorough: with first hits it ends before, and takes half the time."""
 AT_ONCE = 12_000
 """Number of cells times PMs that are bounded in one call: more do not stay in the cache."""
@@ -70,6 +70,7 @@ def search(
     budget: int,
     enough: float = np.inf,
     start: Region | None = None,
+    spent: int = 0,
 ) -> Found | None:
     """Halve cells until those in which the cost may be below the threshold are small, or none is left.
 
@@ -80,6 +81,7 @@ def search(
         budget: number of cells times PMs after which the search stops.
         enough: cells with a bound as high are not looked at further.
         start: cells to start from, of a search with a higher threshold; all rotations where None.
+        spent: what the search that left these cells looked at.
 
     Returns:
         None where a PM is nearer to the array than the array to its axis.
@@ -92,7 +94,7 @@ def search(
         cells = Cells.cover(ALONG)
         intervals = _repeated(known, len(cells))
     else:
-        cells, intervals = start.cells, start.bounds.intervals
+        cells, intervals = start.cells, start.bounds.intervals.within(known)
     ball = _ball(of, known, threshold, enough) if np.isfinite(enough) else 0.0
     least, looked_at = min(threshold, enough), 0
     kept = [_bounded(of, cells.take(_NONE), intervals.take(_NONE), threshold)]
@@ -101,7 +103,7 @@ def search(
         cells, intervals = cells.take(outside), intervals.take(outside)
         if not len(cells):
             break
-        region = _bounded(of, cells, intervals, threshold, thorough=looked_at > EASY)
+        region = _bounded(of, cells, intervals, threshold, thorough=spent + looked_at > EASY)
         looked_at += len(cells) * count
         cost, left = region.bounds.cost, region.bounds.possible & (region.bounds.cost < enough)
         aside = region.bounds.possible & ~left
