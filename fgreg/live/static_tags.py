@@ -51,8 +51,8 @@ BOARD_EVERY_S = 10.0
 """Time between two frames in which a board that was not in view is looked for."""
 UNREST_S = 12.0
 """A move that has not ended after this long, or of which no pose has come, ends with an unknown motion."""
-MOST_ALARMS, ALARMS_S = 8, 300.0
-"""More alarms in this time than any bumped scope gives: the tags are not static."""
+MOST_ALARMS, ALARMS_S = 20, 300.0
+"""More alarms in this time than a bumped scope and tags that are covered now and then give: they are not static."""
 UNSEEN_S = 3.0
 """Once no tag was seen for this long the operator is told."""
 UNSEEN = (
