@@ -299,3 +299,6 @@ def test_pairs_wait_for_a_frame_that_shows_the_static_tags_at_rest() -> None:
     assert not any(isinstance(action, TakePairs) for action in [*moved, *step(20.0, math.inf)])
     workflow._held = [held()]
     assert any(isinstance(action, TakePairs) for action in step(10.0 + SHOWN_S + 0.1, 9.9)), "no tag is in view"
+    workflow._held = [held()]
+    assert [pairs.pm for pairs in workflow.still_held()] == [0], "the session ends"
+    assert workflow.still_held() == ()

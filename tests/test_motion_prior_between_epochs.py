@@ -24,7 +24,7 @@ from fgreg.registration.joint_solve import solve_jointly
 from fgreg.registration.register import pack_session, register, register_near
 from fgreg.registration.solve import distance_to_explicit, solve
 from fgreg.registration.verdict import mirrored
-from tests.forward import MOTION_SIGMA, make_measurements, random_marker_T_laser, random_trus_T_camera
+from tests.forward import MOTION_SIGMA, Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 from tests.online_streams import batch, events, first, restored, run, sigmas_apart, unreported_move
 
 AWAY = make_transform(np.eye(3), np.array([12.0, -9.0, 5.0]))
@@ -239,17 +239,22 @@ def test_of_several_starts_one_registration_results() -> None:
     assert optimum.state.count == 1
 
 
+def _tied(seed: int, counts: tuple[int, ...], looks: int) -> tuple[SessionModel, Measurements, Truth]:
+    """Epochs of so many PMs each, with measured motions between them."""
+    model, whole, truth = make_measurements(
+        np.random.default_rng(seed), aims=6, pairs=9, epochs=len(counts), known_motion=True, looks_per_pm=looks,
+        share_marker=True, look_spacing_deg=2.0, first_hit=False, spread_deg=10.0,
+    )  # fmt: skip
+    left: list[int] = []
+    for epoch, count in enumerate(counts):
+        left += list(dict.fromkeys(pair.pm for pair in whole.pairs if pair.epoch == epoch))[:count]
+    return model, replace(whole, pairs=tuple(pair for pair in whole.pairs if pair.pm in left)), truth
+
+
 @pytest.mark.parametrize("seed", [22, 34, 46])
 def test_an_ambiguous_epoch_takes_the_epochs_tied_to_it_along_to_each_of_its_minima(seed: int) -> None:
     """Of 60 such sessions these three had ended in another minimum alone, up to 550 above the least chi square."""
-    model, whole, truth = make_measurements(
-        np.random.default_rng(seed), aims=6, pairs=9, epochs=3, known_motion=True, looks_per_pm=4, share_marker=True,
-        look_spacing_deg=2.0, first_hit=False, spread_deg=10.0,
-    )  # fmt: skip
-    left: list[int] = []
-    for epoch, count in enumerate((3, 1, 2)):
-        left += list(dict.fromkeys(pair.pm for pair in whole.pairs if pair.epoch == epoch))[:count]
-    measurements = replace(whole, pairs=tuple(pair for pair in whole.pairs if pair.pm in left))
+    model, measurements, truth = _tied(seed, (3, 1, 2), looks=4)
     found = register(measurements, model, CONFIG)
     start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     near = register_near(measurements, model, CONFIG, start, range(3))
@@ -260,14 +265,7 @@ def test_an_ambiguous_epoch_takes_the_epochs_tied_to_it_along_to_each_of_its_min
 @pytest.mark.parametrize("seed", [8, 22])
 def test_an_epoch_of_three_pms_is_not_called_mirrored_for_a_minimum_that_others_exclude(seed: int) -> None:
     """Of 40 such sessions 19 were, where the first of its equally good minima has beams from the probe's side."""
-    model, whole, _ = make_measurements(
-        np.random.default_rng(seed), aims=6, pairs=9, epochs=2, known_motion=True, looks_per_pm=2, share_marker=True,
-        look_spacing_deg=2.0, first_hit=False, spread_deg=10.0,
-    )  # fmt: skip
-    left: list[int] = []
-    for epoch, count in enumerate((4, 3)):
-        left += list(dict.fromkeys(pair.pm for pair in whole.pairs if pair.epoch == epoch))[:count]
-    tied = replace(whole, pairs=tuple(pair for pair in whole.pairs if pair.pm in left))
+    model, tied, _ = _tied(seed, (4, 3), looks=2)
 
     def says_mirrored(measurements: Measurements) -> list[bool]:
         found = register(measurements, model, CONFIG)

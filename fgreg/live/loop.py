@@ -224,7 +224,9 @@ class LiveLoop:
         )
 
     def close(self) -> None:
-        """End the worker processes; a reported move that is not measured yet is recorded without its motion."""
+        """End the worker processes; pairs that still wait, and a reported move without its motion, are recorded."""
+        for pairs in self._workflow.still_held():
+            self._do(pairs)
         if self._static_tags.reported:
             self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
         self.marker_tracker.close()

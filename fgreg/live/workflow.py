@@ -463,6 +463,11 @@ class Workflow:
         out += [pairs for pairs in self._held if pairs not in waits]
         self._held = waits
 
+    def still_held(self) -> tuple[TakePairs, ...]:
+        """Pairs that still wait when the session ends: looks that were taken are recorded."""
+        held, self._held = tuple(self._held), []
+        return held
+
     def _not_found(self, inputs: Inputs, stage: StageView, search: PmSearch, why: NotFound, out: list[Action]) -> None:
         if not search.cold:
             self._search = self._begin(inputs, stage, search.held, cold=True)
