@@ -11,7 +11,8 @@ from fgreg.camera_moves.detector import MoveCase
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import evaluate, refine
+from fgreg.graph.reduced_graph import evaluate
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements
 from fgreg.model.session_model import SessionModel

@@ -22,9 +22,10 @@ from fgreg.camera_moves.whitened import (
     settled_private,
     whiten,
 )
+from fgreg.graph.contributions import contributions
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import contributions, refine
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.graph.split_points import default_scales
 from fgreg.model.solve_config import SolveConfig
@@ -61,7 +62,7 @@ def test_whitened_pairs_have_the_reduced_problems_cost_gradient_and_hessian(look
     terms = whiten(part, pm_degrees_of_freedom(problem), scale)
     jacobian, residual = terms.jacobian[0], terms.residual[0]
     hessian = np.swapaxes(jacobian, -1, -2) @ jacobian * scale * scale[:, None]
-    np.testing.assert_allclose(hessian, part.hessian[0] * scale * scale[:, None], rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(hessian, part.hessian()[0] * scale * scale[:, None], rtol=1e-6, atol=1e-8)
     gradient = np.einsum("nqd,nq->nd", jacobian, residual) * scale
     np.testing.assert_allclose(gradient, part.gradient[0] * scale, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(np.sum(residual**2, axis=-1) + terms.rest[0], part.cost[0], rtol=1e-9)
@@ -162,7 +163,7 @@ def test_screening_is_the_full_test_where_all_is_gaussian() -> None:
     problem = pack_session(replace(measurements, aims=()), model, PLAIN)
     parts = contributions(problem, case.known.state, settled_private(problem, case.known.state)).pm
     screened = screening(parts, case.inlier, case.known, pm_limits(problem))
-    hessian = case.known.hessian + parts.hessian[0, :8].sum(axis=0)
+    hessian = case.known.hessian + parts.hessian()[0, :8].sum(axis=0)
     gradient = case.known.gradient + parts.gradient[0, :8].sum(axis=0)
     before = gaussian_of(hessian, gradient, problem.columns)
     assert before is not None

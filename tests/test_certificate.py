@@ -21,8 +21,9 @@ from fgreg.certificate.rotations import Cells, Reach
 from fgreg.certificate.search import narrowed
 from fgreg.cli.main import app
 from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, log_so3
-from fgreg.graph.reduced_graph import contributions, private_at, refine
+from fgreg.graph.contributions import contributions
 from fgreg.graph.reduced_solver import optimize
+from fgreg.graph.reduced_system import private_at, refine
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.solve_config import SolveConfig

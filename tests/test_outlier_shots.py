@@ -11,8 +11,9 @@ import pytest
 
 from fgreg.geometry.transforms import as_float_array, exp_so3
 from fgreg.graph.packing import pack
-from fgreg.graph.reduced_graph import log_posterior, refine
+from fgreg.graph.reduced_graph import log_posterior
 from fgreg.graph.reduced_solver import optimize
+from fgreg.graph.reduced_system import refine
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Aim, MarkerObservation, Measurements, Pair, Wavefront
 from fgreg.model.session_model import SessionModel

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.contributions import contributions
 from fgreg.graph.gtsam_graph import ExplicitGraph, GraphOptions, build_graph
 from fgreg.graph.gtsam_values import SharedValues
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import Costs, Weights, contributions, evaluate, log_posterior, private_at, refine
+from fgreg.graph.reduced_graph import Costs, Weights, evaluate, log_posterior
 from fgreg.graph.reduced_solver import Optimum, distinct, optimize
+from fgreg.graph.reduced_system import private_at, refine
 from fgreg.graph.shared_state import SharedState, make_state, stack_states, step_between
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.systematic import Systematic
@@ -134,12 +136,13 @@ def test_contributions_of_pms_sum_to_the_whole() -> None:
     # Evaluated at the same shared state: what the pairs add is the whole less what aims and priors say.
     rest = evaluate(alone, found.state, _aims_only(alone, found))
     whole = evaluate(problem, found.state, found.evaluation.private)
-    pm, others = parts.pm, (parts.aim, parts.prior)
-    np.testing.assert_allclose(pm.hessian[0].sum(axis=0) + rest.hessian[0], whole.hessian[0], rtol=1e-6, atol=1e-6)
+    pm = parts.pm
+    np.testing.assert_allclose(pm.hessian()[0].sum(axis=0) + rest.hessian[0], whole.hessian[0], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(pm.gradient[0].sum(axis=0) + rest.gradient[0], whole.gradient[0], atol=1e-5)
     assert pm.cost.sum() + rest.cost[0] == pytest.approx(whole.cost[0], rel=1e-9)
-    np.testing.assert_allclose(sum(part.hessian[0].sum(axis=0) for part in others), rest.hessian[0], rtol=1e-9)
-    assert sum(part.cost.sum() for part in others) == pytest.approx(rest.cost[0], rel=1e-9)
+    others = parts.aim.hessian().sum(axis=1) + parts.prior_hessian
+    np.testing.assert_allclose(others, rest.hessian, rtol=1e-9)
+    assert parts.aim.cost.sum() + parts.prior_cost[0] == pytest.approx(rest.cost[0], rel=1e-9)
 
 
 def _aims_only(alone: PackedProblem, found: Optimum) -> Any:
@@ -203,7 +206,7 @@ def test_a_loss_weighs_as_shots_left_out_do() -> None:
 
     weighted = evaluate(problem, state, private, without_one)
     parts = contributions(problem, state, private)
-    left = [parts.prior.hessian[0, 0], parts.pm.hessian[0, kept].sum(axis=0), parts.aim.hessian[0].sum(axis=0)]
+    left = [parts.prior_hessian[0], parts.pm.total(kept.astype(float))[0], parts.aim.total()[0]]
     np.testing.assert_allclose(weighted.hessian[0], sum(left), rtol=1e-6, atol=1e-6)
     rest = replace(measurements, pairs=tuple(pair for pair in measurements.pairs if pair.pm != problem.pms[4]))
     alone = pack(rest, model)

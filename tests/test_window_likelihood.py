@@ -13,8 +13,9 @@ from fgreg.geometry.transforms import FloatArray, inverse, transform_points
 from fgreg.graph.expectation_propagation import propagate, with_sites
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import log_posterior, refine
+from fgreg.graph.reduced_graph import log_posterior
 from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.graph.window_likelihood import log_shape_ratios
 from tests.forward import make_measurements, make_session

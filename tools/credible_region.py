@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.reduced_graph import evaluate, log_posterior, refine
+from fgreg.graph.reduced_graph import evaluate, log_posterior
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.registration.posterior import (
     QUANTILE,

@@ -18,7 +18,8 @@ from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import target_jacobians
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import evaluate, refine
+from fgreg.graph.reduced_graph import evaluate
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.model.measurements import Aim, EpochStart, Measurements
 from fgreg.model.session_model import SessionModel

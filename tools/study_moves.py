@@ -27,7 +27,8 @@ from fgreg.camera_moves.found import DetectedMove
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import log_posterior, refine
+from fgreg.graph.reduced_graph import log_posterior
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import make_state
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel

@@ -28,9 +28,10 @@ import numpy as np
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, transform_points
+from fgreg.graph.contributions import contributions
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import contributions, refine
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import make_state
 from fgreg.model.measurements import Aim, Measurements, Pair
 from fgreg.model.session_model import SessionModel

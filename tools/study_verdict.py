@@ -49,7 +49,8 @@ from fgreg.geometry.transforms import (
 )
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import evaluate, refine
+from fgreg.graph.reduced_graph import evaluate
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import make_state
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import MarkerObservation, Measurements

@@ -32,8 +32,8 @@ from fgreg.camera_moves.loop_closure import (
 )
 from fgreg.camera_moves.whitened import POSE, gaussian_of, linearise, settled_private
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
+from fgreg.graph.contributions import Contributions, contributions
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced_graph import Contributions, contributions
 from fgreg.graph.shared_state import Quadratic
 from fgreg.graph.split_points import GATE, log_move_odds, logsumexp
 from fgreg.model.measurements import EpochStart, Measurements, Pair
@@ -174,7 +174,7 @@ def screening(parts: Contributions, inlier: BoolArray, known: Quadratic, limit: 
         limit: (n,) chi square beyond which a PM is an outlier.
     """
     weight = np.where(inlier, 1.0, np.minimum(limit / np.maximum(parts.cost[0], 1e-12), 1.0))
-    gradient, hessian = weight[:, None] * parts.gradient[0], weight[:, None, None] * parts.hessian[0]
+    gradient, hessian = weight[:, None] * parts.gradient[0], weight[:, None, None] * parts.hessian()[0]
     total = known.hessian + hessian.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-30))
     covariance = np.linalg.inv(total * scale * scale[:, None] + 1e-12 * np.eye(len(scale))) * scale * scale[:, None]
@@ -210,7 +210,7 @@ def _full_test(
     known = _without_pose(known) if backward else known
     stream = packed([case.pms[i] for i in following], shapes=True)
     before = gaussian_of(
-        known.hessian + parts.hessian[0, counting].sum(axis=0),
+        known.hessian + parts.hessian(counting)[0].sum(axis=0),
         known.gradient + parts.gradient[0, counting].sum(axis=0),
         stream.columns,
     )

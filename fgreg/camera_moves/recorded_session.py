@@ -15,7 +15,7 @@ from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
 from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import IntArray
-from fgreg.graph.reduced_graph import pm_contributions
+from fgreg.graph.contributions import contributions
 from fgreg.graph.shared_state import Quadratic, one_epoch
 from fgreg.graph.split_points import ALARM, logsumexp
 from fgreg.model.measurements import EpochStart, Measurements
@@ -175,10 +175,11 @@ def _case(
 def _known(registration: Registration, without: int, of: int) -> Quadratic:
     """The prior of one epoch's shared variables (``of``) from everything but the pairs of one epoch (``without``)."""
     problem, optimum = registration.problem, registration.optimum
-    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
-    left_out = np.unique(problem.beam_pm[problem.beam_epoch == without])
-    hessian = optimum.evaluation.hessian[0] - parts.hessian[left_out].sum(axis=0)
-    gradient = optimum.evaluation.gradient[0] - parts.gradient[left_out].sum(axis=0)
+    parts = contributions(problem, optimum.state, optimum.evaluation.private).pm
+    left_out = np.zeros(len(problem.pms))
+    left_out[problem.beam_pm[problem.beam_epoch == without]] = 1.0
+    hessian = optimum.evaluation.hessian[0] - parts.total(left_out)[0]
+    gradient = optimum.evaluation.gradient[0] - left_out @ parts.gradient[0]
     mine = _columns(registration, of)
     others: IntArray = np.setdiff1d(np.arange(problem.columns.size), mine)
     if len(others):

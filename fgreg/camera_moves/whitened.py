@@ -13,9 +13,11 @@ import numpy as np
 
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.columns import Columns
+from fgreg.graph.contributions import Contributions, contributions
 from fgreg.graph.packing import PackedProblem, edge_sigma_rad
 from fgreg.graph.reduced_blocks import PrivateState, initial_private, look_block, times
-from fgreg.graph.reduced_graph import Contributions, contributions, evaluate, refine
+from fgreg.graph.reduced_graph import evaluate
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.graph.window_likelihood import LEAST_PRECISION
 from fgreg.model.systematic import TEXTS
@@ -111,12 +113,12 @@ def whiten(part: Contributions, equations: IntArray, scale: FloatArray, at: Floa
     """Whitened equations of PMs by pivoted Cholesky, with one row per equation.
 
     Args:
-        part: cost (S, n), gradient (S, n, D), hessian (S, n, D, D).
+        part: cost (S, n), gradient (S, n, D) and Hessians of n PMs.
         equations: (n,).
         scale: (D,) typical steps.
         at: (S, D) steps from the base to the linearisation point of ``part``; None: it is the base.
     """
-    hessian, gradient = part.hessian.copy(), part.gradient.copy()
+    hessian, gradient = part.hessian(), part.gradient.copy()
     count, n, size = gradient.shape
     rows = int(equations.max()) if n else 0
     residual, jacobian = np.zeros((count, n, rows)), np.zeros((count, n, rows, size))

@@ -13,12 +13,13 @@ from fgreg.evaluation.pair_residual import line_to_arc
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import expected_tre_mm, tre_mm
 from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.contributions import contributions
 from fgreg.graph.packing import pack_more
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import pm_contributions, refine
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Pair
-from fgreg.registration.outliers import pm_degrees_of_freedom
+from fgreg.registration.outliers import pm_degrees_of_freedom, pm_innovations
 from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register
 
@@ -161,10 +162,9 @@ def predict(registration: Registration, pairs: Sequence[Pair]) -> tuple[HeldOutP
     private = initial_private(problem, state)
     for _ in range(REFINEMENTS):
         private = refine(problem, state, private)
-    parts = pm_contributions(problem, state, private)
+    parts = contributions(problem, state, private).pm
     information = registration.optimum.evaluation.hessian[0]
-    moved = np.linalg.solve(information + parts.hessian, parts.gradient[..., None])[..., 0]
-    nis = parts.cost - np.sum(parts.gradient * moved, axis=-1)
+    nis = pm_innovations(problem, parts, information, np.zeros(len(problem.pms), dtype=bool))
     freedom = pm_degrees_of_freedom(problem)
     out = []
     for index, pm in enumerate(problem.pms):

@@ -10,7 +10,8 @@ import numpy as np
 from fgreg.geometry.transforms import BoolArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState
-from fgreg.graph.reduced_graph import Evaluation, Loss, evaluate, least_squares, private_at, refine
+from fgreg.graph.reduced_graph import Evaluation, Loss, evaluate, least_squares
+from fgreg.graph.reduced_system import private_at, refine
 from fgreg.graph.shared_state import SharedState, step_between
 
 WEIGHT_FLOOR = 1e-12

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgreg.geometry.transforms import FloatArray
+from fgreg.geometry.transforms import FloatArray, IntArray
 
+UNKNOWN = 1e-9
+"""Eigenvalue of a Hessian with a unit diagonal below which a direction is not determined."""
 SINGULAR = 1e13
 """Trace of the inverse, of a matrix with a unit diagonal, from which it is rounding error."""
 
@@ -37,6 +39,21 @@ def scaled_inverse(matrix: FloatArray) -> FloatArray:
     if not np.trace(inverse) < SINGULAR:
         raise np.linalg.LinAlgError("singular up to rounding")
     return np.asarray(inverse * outer, dtype=np.float64)
+
+
+def without_others(matrix: FloatArray, stay: IntArray) -> FloatArray:
+    """Schur complement (K, K) of a Hessian (D, D): of the variables ``stay`` (K,), all others eliminated.
+
+    Directions in which the others are not determined have no influence.
+    """
+    others = np.setdiff1d(np.arange(len(matrix)), stay)
+    if not len(others):
+        return matrix[np.ix_(stay, stay)]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix)[others], 1e-30))
+    block = matrix[np.ix_(others, others)] * scale * scale[:, None]
+    across = matrix[np.ix_(others, stay)] * scale[:, None]
+    reduced = matrix[np.ix_(stay, stay)] - across.T @ np.linalg.pinv(block, rcond=UNKNOWN, hermitian=True) @ across
+    return np.asarray(0.5 * (reduced + reduced.T))
 
 
 def inverse_hessian(hessian: FloatArray) -> FloatArray | None:

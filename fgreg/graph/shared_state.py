@@ -10,6 +10,7 @@ import numpy as np
 from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transform, rotation_to_direction
 from fgreg.graph.columns import Columns
+from fgreg.graph.scaled_inverse import UNKNOWN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,10 +124,6 @@ def chart_turn(step: FloatArray) -> FloatArray:
     turn[1, 0], turn[2, 0], turn[2, 1] = z, -y, x
     turn[3:6, 3:6] = exp_so3(step[:3])
     return turn
-
-
-UNKNOWN = 1e-9
-"""Eigenvalue of a Hessian with a unit diagonal below which a direction is not determined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,7 +34,8 @@ from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.graph.known_points import point_arrays
 from fgreg.graph.packing import PackedProblem, constants_prior, least_sigmas
 from fgreg.graph.reduced_blocks import PrivateState
-from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
+from fgreg.graph.reduced_graph import Evaluation, evaluate
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.scaled_inverse import scaled_inverse, scaled_solve
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.camera_dependence import nominal_spot_gain

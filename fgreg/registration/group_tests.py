@@ -17,8 +17,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from fgreg.geometry.transforms import BoolArray, FloatArray
+from fgreg.graph.contributions import contributions, pm_columns
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced_graph import pm_contributions
 from fgreg.graph.reduced_solver import Optimum
 from fgreg.model.estimate import Verdict
 from fgreg.registration.verdict import Condition
@@ -53,13 +53,15 @@ def group_conditions(problem: PackedProblem, optimum: Optimum, covariance: Float
     partings = [p for p in _partings(problem, mine) if min(p.second.sum(), (~p.second).sum()) >= LEAST_PMS]
     if not partings:
         return []
-    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
-    pose = slice(6 * epoch, 6 * epoch + 6)
+    parts = contributions(problem, optimum.state, optimum.evaluation.private).pm
+    columns = pm_columns(problem, mine)
+    pose = np.flatnonzero((columns >= 6 * epoch) & (columns < 6 * epoch + 6))
+    gradient, hessian = parts.gradient[0, mine][:, columns[pose]], parts.hessian(mine, columns)[0][:, pose]
+    covariance = covariance[np.ix_(columns, columns)]
     found = []
     for parting in partings:
-        group = mine[parting.second]
-        across = parts.hessian[group, pose].sum(axis=0)
-        pull = -parts.gradient[group, pose].sum(axis=0)
+        across = hessian[parting.second].sum(axis=0)
+        pull = -gradient[parting.second].sum(axis=0)
         information = across[:, pose] - across @ covariance @ across.T
         chi2, freedom = _score(information, pull)
         if freedom and chdtrc(freedom, chi2) < DIFFERENT_P:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.geometry.target_error import expected_tre_mm, moved_mm
-from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.reduced_graph import pm_contributions
-from fgreg.graph.scaled_inverse import inverse_hessian
+from fgreg.geometry.transforms import FloatArray, IntArray
+from fgreg.graph.contributions import contributions, pms_by_epochs
+from fgreg.graph.scaled_inverse import inverse_hessian, without_others
 from fgreg.registration.register import Registration
 
 
@@ -48,23 +48,29 @@ def influences(
     predicted TRE of each of the session's epochs (mean over targets), from the whole posterior; None: that Gaussian's.
     """
     problem, optimum = registration.problem, registration.optimum
-    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
-    hessian = optimum.evaluation.hessian[0]
+    parts = contributions(problem, optimum.state, optimum.evaluation.private).pm
+    without: dict[int, tuple[IntArray, FloatArray]] = {}
+    for group in pms_by_epochs(problem):
+        reduced = without_others(optimum.evaluation.hessian[0], group.columns)
+        own = parts.hessian(group.pms, group.columns)[0]
+        without |= {int(pm): (group.columns, reduced - one) for pm, one in zip(group.pms, own, strict=True)}
     out = []
     for index, pm in enumerate(problem.pms):
         place = int(problem.beam_epoch[np.flatnonzero(problem.beam_pm == index)[0]])
         transform = optimum.state.trus_T_camera(place)[0]
-        block = slice(6 * place, 6 * place + 6)
-        rest = hessian - parts.hessian[index]
-        gaussian = float(expected_tre_mm(registration.covariance[block, block], transform, targets_mm).mean())
+        pose = slice(6 * place, 6 * place + 6)
+        columns, rest = without[index]
+        first = int(np.searchsorted(columns, pose.start))
+        block = slice(first, first + 6)
+        gaussian = float(expected_tre_mm(registration.covariance[pose, pose], transform, targets_mm).mean())
         expected = gaussian if predicted_mm is None else predicted_mm[registration.epochs[place]]
         covariance = inverse_hessian(rest)
-        step, without, moved = np.full(6, np.inf), np.inf, np.full(1, np.inf)
+        step, expected_without, moved = np.full(6, np.inf), np.inf, np.full(1, np.inf)
         if covariance is not None:
-            step = (covariance @ parts.gradient[index])[block]
+            step = (covariance @ parts.gradient[0, index, columns])[block]
             moved = moved_mm(step, transform, targets_mm)
-            without = float(expected_tre_mm(covariance[block, block], transform, targets_mm).mean())
-            without *= expected / gaussian
+            expected_without = float(expected_tre_mm(covariance[block, block], transform, targets_mm).mean())
+            expected_without *= expected / gaussian
         out.append(
             Influence(
                 pm=pm,
@@ -73,7 +79,7 @@ def influences(
                 moved_mm=float(moved.mean()),
                 worst_moved_mm=float(moved.max()),
                 expected_mm=expected,
-                expected_without_mm=without,
+                expected_without_mm=expected_without,
             )
         )
     return tuple(out)

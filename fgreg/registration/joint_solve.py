@@ -10,8 +10,9 @@ import numpy as np
 from fgreg.geometry.transforms import BoolArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
+from fgreg.graph.reduced_graph import Evaluation, evaluate
 from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Look, Measurements
 from fgreg.registration.multistart import MIN_INLIER_AIMS, MIN_INLIER_PMS

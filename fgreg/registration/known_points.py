@@ -8,7 +8,6 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.known_points import point_terms
-from fgreg.graph.reduced_graph import Contributions
 from fgreg.model.estimate import PointEstimate, Verdict
 from fgreg.model.known_points import nis_limit
 from fgreg.model.measurements import Measurements
@@ -31,8 +30,8 @@ def read_points(
     """
     problem, at = registration.problem, registration.optimum.evaluation
     terms = point_terms(problem.points, registration.optimum.state, problem.columns)
-    part = Contributions(terms.cost, terms.gradient, terms.hessian)
-    nis = innovations_of(part, at.hessian[0], np.ones(len(problem.points), dtype=bool))
+    inlier = np.ones(len(problem.points), dtype=bool)
+    nis = innovations_of(terms.cost[0], terms.gradient[0], terms.hessian[0], at.hessian[0], inlier)
     out, place = [], 0
     for point in measurements.points:
         if point.epoch not in registration.epochs:

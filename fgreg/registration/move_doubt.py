@@ -10,8 +10,8 @@ import numpy as np
 from fgreg.errors import EstimationError
 from fgreg.geometry.target_error import target_jacobians
 from fgreg.geometry.transforms import BoolArray, FloatArray
-from fgreg.graph.reduced_graph import pm_contributions
-from fgreg.graph.scaled_inverse import scaled_inverse
+from fgreg.graph.contributions import contributions, pm_columns
+from fgreg.graph.scaled_inverse import scaled_inverse, without_others
 from fgreg.graph.split_points import ALARM, MovedRegistrations, logsumexp, moved_registrations
 from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
@@ -83,16 +83,21 @@ def moves_in_epoch(
     problem = shots.problem
     mine = np.unique(problem.beam_pm[problem.beam_epoch == place])
     mine = mine if outliers else mine[shots.pm_inlier[mine]]
-    parts = pm_contributions(problem, optimum.state, shots.evaluation.private)
+    parts = contributions(problem, optimum.state, shots.evaluation.private).pm
+    columns = pm_columns(problem, mine)
     out = ~shots.pm_inlier[mine]
-    weight = np.where(out, np.minimum(pm_limits(problem)[mine] / np.maximum(parts.cost[mine], 1e-12), 1.0), 1.0)
-    gradient, hessian = weight[:, None] * parts.gradient[mine], weight[:, None, None] * parts.hessian[mine]
-    pose, covariance = slice(6 * place, 6 * place + 6), registration.covariance
-    step = np.zeros(len(covariance))  # from the registration, that of the inliers, to that of all
+    cost = parts.cost[0, mine]
+    weight = np.where(out, np.minimum(pm_limits(problem)[mine] / np.maximum(cost, 1e-12), 1.0), 1.0)
+    gradient = weight[:, None] * parts.gradient[0, mine][:, columns]
+    hessian = weight[:, None, None] * parts.hessian(mine, columns)[0]
+    covariance = registration.covariance[np.ix_(columns, columns)]
+    step = np.zeros(len(columns))  # from the registration, that of the inliers, to that of all
     if out.any():
-        total = optimum.evaluation.hessian[0] + hessian[out].sum(axis=0)
-        covariance = scaled_inverse(total)
+        rest = without_others(optimum.evaluation.hessian[0], columns)
+        covariance = scaled_inverse(rest + hessian[out].sum(axis=0))
         step = -covariance @ gradient[out].sum(axis=0)
+    first = int(np.searchsorted(columns, 6 * place))
+    pose = slice(first, first + 6)
     moved = moved_registrations(gradient + hessian @ step, hessian, covariance, pose)
     return tuple(problem.pms[pm] for pm in mine), replace(moved, mean=moved.mean + step[pose])
 

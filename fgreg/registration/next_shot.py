@@ -32,9 +32,12 @@ from fgreg.geometry.transforms import (
     rotation_to_direction,
     transform_points,
 )
+from fgreg.graph.contributions import contributions, pm_columns
 from fgreg.graph.packing import PackedProblem, pack, pack_more
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import evaluate, pm_contributions, refine
+from fgreg.graph.reduced_graph import evaluate
+from fgreg.graph.reduced_system import refine
+from fgreg.graph.scaled_inverse import without_others
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.lens import in_view
 from fgreg.model.measurements import EpochStart, Look, MarkerObservation, Measurements, Pair
@@ -175,8 +178,10 @@ def advise(
     transform = state.trus_T_camera(place)[0]
     block = slice(6 * place, 6 * place + 6)
     problem = pack_more([pair for shot in found.shots for pair in shot], model, registration.problem.columns)
-    added = _contributions(problem, state, found.trus_p_mm)[2]
-    after = np.linalg.inv(registration.optimum.evaluation.hessian[0] + added)[:, block, block]
+    _, _, added, columns = _contributions(problem, state, found.trus_p_mm)
+    # The candidates' registration comes first of the columns; those of other epochs are eliminated.
+    information = without_others(registration.optimum.evaluation.hessian[0], columns) + added
+    after = np.asarray(np.linalg.inv(information)[:, :6, :6], dtype=np.float64)
     expected = expected_tre_mm(after, transform, model.targets_mm).mean(axis=-1)
     jacobian = target_jacobians(transform, model.targets_mm)
     square = np.einsum("nij,sjk,nik->s", jacobian, after, jacobian) / len(model.targets_mm)
@@ -430,13 +435,17 @@ class _Separation:
 
 def _contributions(
     problem: PackedProblem, state: SharedState, trus_p: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Cost (n,), gradient (n, D) and Hessian (n, D, D) of virtual pairs at a state, PMs started at (n, 3)."""
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Cost (n,), gradient (n, K) and Hessian (n, K, K) of virtual pairs of one epoch at a state, and K columns.
+
+    PMs are started at (n, 3).
+    """
     private = replace(initial_private(problem, state), trus_p_pm=trus_p[None])
     for _ in range(REFINEMENTS):
         private = refine(problem, state, private)
-    parts = pm_contributions(problem, state, private)
-    return parts.cost, parts.gradient, parts.hessian
+    parts = contributions(problem, state, private).pm
+    columns = pm_columns(problem, np.arange(len(trus_p)))
+    return parts.cost[0], parts.gradient[0][:, columns], parts.hessian(columns=columns)[0], columns
 
 
 def _separate(registration: Registration, epoch: int, found: Candidates) -> _Separation | None:
@@ -470,7 +479,7 @@ def _separate(registration: Registration, epoch: int, found: Candidates) -> _Sep
         Measurements((), tuple(replace(p, epoch=0) for s in found.shots for p in s), (EpochStart(0.0),)), model
     )
     # The looks are those that the best registration predicts, so the rival's PMs start there, too.
-    c, g, a = _contributions(virtual, rival.state, found.trus_p_mm)
+    c, g, a, _ = _contributions(virtual, rival.state, found.trus_p_mm)
     chi2 = c - np.sum(g * np.linalg.solve(rival_hessian + a, g[..., None])[..., 0], axis=-1)
     return _Separation(weight, rival_cost - cost, apart(rival), np.maximum(chi2, 0.0))
 

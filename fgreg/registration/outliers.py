@@ -21,21 +21,14 @@ import numpy as np
 from scipy.special import chdtri
 
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
+from fgreg.graph.contributions import Contributions, Parts, contributions, pms_by_epochs
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState
-from fgreg.graph.reduced_graph import (
-    DIVERGED_MM,
-    Contributions,
-    Costs,
-    Loss,
-    Parts,
-    Weights,
-    contributions,
-    evaluate,
-    private_at,
-)
+from fgreg.graph.reduced_graph import Costs, Loss, Weights, evaluate
 from fgreg.graph.reduced_solver import distinct, optimize
-from fgreg.graph.shared_state import UNKNOWN, SharedState
+from fgreg.graph.reduced_system import DIVERGED_MM, private_at
+from fgreg.graph.scaled_inverse import UNKNOWN, without_others
+from fgreg.graph.shared_state import SharedState
 
 OUTLIER_P = 1e-3
 """A shot is an outlier where an inlier would deviate as much with at most this probability."""
@@ -148,9 +141,8 @@ class RobustOptimum:
 
 def _hessian_of(parts: Parts, pm: BoolArray, aim: BoolArray) -> FloatArray:
     """Hessian (D, D) of the prior and the inliers, one hypothesis."""
-    return np.asarray(
-        parts.prior.hessian[0, 0] + parts.pm.hessian[0, pm].sum(axis=0) + parts.aim.hessian[0, aim].sum(axis=0)
-    )
+    weights = pm.astype(np.float64), aim.astype(np.float64)
+    return np.asarray((parts.prior_hessian + parts.pm.total(weights[0]) + parts.aim.total(weights[1]))[0])
 
 
 def _cauchy(costs: Costs, scale: float, aim_scale: float) -> Weights:
@@ -284,52 +276,33 @@ def innovations(problem: PackedProblem, parts: Parts, pm_inlier: BoolArray, aim_
     """
     hessian = _hessian_of(parts, pm_inlier, aim_inlier)
     return Innovations(
-        _innovation_by_epoch(problem, parts.pm, hessian, pm_inlier), _innovation(parts.aim, hessian, aim_inlier)
+        pm_innovations(problem, parts.pm, hessian, pm_inlier),
+        innovations_of(*parts.aim.single(), hessian, aim_inlier),
     )
 
 
-def _innovation_by_epoch(
-    problem: PackedProblem, part: Contributions, hessian: FloatArray, kept: BoolArray
-) -> FloatArray:
-    """:func:`_innovation` of PMs (J,). The registrations of other epochs, which a PM does not observe, are eliminated
+def pm_innovations(problem: PackedProblem, part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
+    """:func:`innovations_of` PMs (J,) of a problem. The registrations of epochs that PMs do not observe are eliminated
     from the Hessian once for each epoch, so that each PM has a small system."""
-    epochs, size = problem.columns.epochs, len(hessian)
-    if epochs == 1:
-        return _innovation(part, hessian, kept)
-    epoch_of = np.zeros(len(problem.pms), dtype=np.int64)
-    epoch_of[problem.beam_pm] = problem.beam_epoch
-    single = np.bincount(problem.beam_pm, problem.beam_epoch != epoch_of[problem.beam_pm], len(epoch_of)) == 0
     out = np.empty(len(kept))
-    for epoch in range(epochs):
-        mine = single & (epoch_of == epoch)
-        if not mine.any():
-            continue
-        stay = np.r_[6 * epoch : 6 * epoch + 6, 6 * epochs : size]
-        own = Contributions(
-            part.cost[:, mine], part.gradient[:, mine][..., stay], part.hessian[:, mine][..., stay, :][..., stay]
-        )
-        out[mine] = _innovation(own, _without_others(hessian, stay), kept[mine])
-    if not single.all():
-        rest = ~single
-        own = Contributions(part.cost[:, rest], part.gradient[:, rest], part.hessian[:, rest])
-        out[rest] = _innovation(own, hessian, kept[rest])
+    for group in pms_by_epochs(problem):
+        stay = group.columns
+        own = part.single(group.pms, stay)
+        out[group.pms] = innovations_of(*own, without_others(hessian, stay), kept[group.pms])
     return out
 
 
-def _without_others(hessian: FloatArray, stay: IntArray) -> FloatArray:
-    """Schur complement: the Hessian of the variables ``stay``, the others eliminated."""
-    others = np.setdiff1d(np.arange(len(hessian)), stay)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian)[others], 1e-30))
-    block = hessian[np.ix_(others, others)] * scale * scale[:, None]
-    across = hessian[np.ix_(others, stay)] * scale[:, None]
-    back = np.linalg.pinv(block, rcond=UNKNOWN, hermitian=True)
-    reduced = hessian[np.ix_(stay, stay)] - across.T @ back @ across
-    return np.asarray(0.5 * (reduced + reduced.T))
+def innovations_of(
+    cost: FloatArray, gradient: FloatArray, own: FloatArray, hessian: FloatArray, kept: BoolArray
+) -> FloatArray:
+    """Innovations (n,) of shots at the optimum of the inliers, one hypothesis.
 
-
-def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
+    Args:
+        cost, gradient, own: (n,), (n, D), (n, D, D) contributions of the shots.
+        hessian: (D, D) of the inliers and priors together.
+        kept: (n,) which shots are inliers.
+    """
     sign = np.where(kept, -1.0, 1.0)
-    cost, gradient, own = part.cost[0], part.gradient[0], part.hessian[0]
     # Variables that no shot observes (the pose, of aims) do not matter.
     seen = np.diag(hessian + own.sum(axis=0)) > UNKNOWN
     if not seen.any():
@@ -345,11 +318,6 @@ def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> Fl
     moved = np.sum(along**2 / np.maximum(eigenvalue, 1e-12), axis=1)
     out[good] = np.where(eigenvalue[:, 0] > UNKNOWN, cost[good] - sign[good] * moved, np.inf)
     return out
-
-
-def innovations_of(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
-    """Innovations (n,) of shots, one hypothesis, at the optimum of the inliers (n,), whose Hessian (D, D) is given."""
-    return _innovation(part, hessian, kept)
 
 
 def innovations_at(
@@ -438,6 +406,6 @@ def predicted_pms(others: PackedProblem, problem: PackedProblem, selection: Inli
     """(J,) whether PMs that are not in ``problem``, over the same shared variables, fit its inliers."""
     hessian = _hessian_of(_settled_parts(problem, selection.state), selection.pm_inlier, selection.aim_inlier)
     none = np.zeros(len(others.pms), dtype=bool)
-    innovation = _innovation(_settled_parts(others, selection.state).pm, hessian, none)
+    innovation = pm_innovations(others, _settled_parts(others, selection.state).pm, hessian, none)
     limits = limits_among(others, none, int(selection.pm_inlier.sum()), len(selection.pm_inlier))
     return np.asarray(innovation <= limits)

@@ -19,8 +19,9 @@ from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, inverse, lo
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem, only_aims, without_aims
 from fgreg.graph.reduced_blocks import PrivateState, cross
-from fgreg.graph.reduced_graph import evaluate, log_posterior, refine
+from fgreg.graph.reduced_graph import evaluate, log_posterior
 from fgreg.graph.reduced_solver import Optimum
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import Quadratic, SharedState, step_between
 from fgreg.graph.split_points import logsumexp
 from fgreg.model.estimate import PredictedTre

@@ -16,8 +16,9 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.expectation_propagation import propagate
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
-from fgreg.graph.reduced_graph import evaluate, refine
+from fgreg.graph.reduced_graph import evaluate
 from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.graph.shared_state import SharedState, make_state, stack_states
 from fgreg.model.solve_config import SolveConfig

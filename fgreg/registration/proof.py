@@ -15,8 +15,10 @@ import numpy as np
 
 from fgreg.certificate.certify import Certificate, WithoutPairs, certify
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.reduced_graph import contributions, evaluate, private_at, refine
+from fgreg.graph.contributions import contributions
+from fgreg.graph.reduced_graph import evaluate
 from fgreg.graph.reduced_solver import optimize
+from fgreg.graph.reduced_system import private_at, refine
 from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.model.estimate import CertificateEstimate, Verdict
 from fgreg.model.solve_config import SolveConfig
@@ -89,8 +91,8 @@ def without_pairs(registration: Registration, place: int) -> WithoutPairs | None
     problem, optimum = registration.problem, registration.optimum
     state, private = optimum.state, optimum.evaluation.private
     parts, beam = contributions(problem, state, private), slice(problem.columns.beam, problem.columns.beam + 4)
-    hessian = (parts.aim.hessian[0].sum(axis=0) + parts.prior.hessian[0, 0])[beam, beam]
-    gradient = (parts.aim.gradient[0].sum(axis=0) + parts.prior.gradient[0, 0])[beam]
+    hessian = (parts.aim.total() + parts.prior_hessian)[0, beam, beam]
+    gradient = (parts.aim.gradient[0].sum(axis=0) + parts.prior_gradient[0])[beam]
     covariance = inverse_hessian(hessian)
     if covariance is None or np.sqrt(np.diag(covariance)[2:]).max() > KNOWN_SLOPE:
         return None

@@ -11,9 +11,10 @@ from scipy.special import chdtri
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
+from fgreg.graph.contributions import Parts, contributions
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import DIVERGED_MM, Parts, contributions, refine
+from fgreg.graph.reduced_system import DIVERGED_MM, refine
 from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements
 from fgreg.registration.outliers import (
@@ -75,7 +76,7 @@ def misplaced_pms(state: State, setting: Setting) -> frozenset[int]:
     parts, problem = _parts(measurements, active.state, setting)
     is_inlier = {shot.label: shot.inlier for shot in state.current}
     inlier = np.array([is_inlier[label] for label in problem.pms])
-    found = innovations_of(parts.pm, _information(active), inlier)
+    found = innovations_of(*parts.pm.single(), _information(active), inlier)
     limits = limits_among(problem, inlier, *state.counts())
     misplaced = np.isfinite(found) & (inlier == (found > limits))
     return frozenset(label for label, wrong in zip(problem.pms, misplaced, strict=True) if wrong)
@@ -84,7 +85,7 @@ def misplaced_pms(state: State, setting: Setting) -> frozenset[int]:
 def aim_fits(aim: Aim, active: ActiveWindow, setting: Setting) -> bool:
     """Whether a calibration shot agrees with the estimate."""
     parts, _ = _parts(Measurements((aim,), (), (EpochStart(0.0),)), active.state, setting)
-    found = innovations_of(parts.aim, _information(active), np.zeros(1, dtype=bool))
+    found = innovations_of(*parts.aim.single(), _information(active), np.zeros(1, dtype=bool))
     return bool(found[0] <= AIM_LIMIT)
 
 

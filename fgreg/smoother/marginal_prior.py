@@ -13,7 +13,8 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
-from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
+from fgreg.graph.reduced_graph import Evaluation, evaluate
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.shared_state import Quadratic, SharedState, one_epoch
 from fgreg.model.measurements import EpochStart
 from fgreg.model.systematic import TEXTS

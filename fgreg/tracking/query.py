@@ -19,7 +19,8 @@ from fgreg.geometry.transforms import FloatArray, exp_so3, parent_from_right_cov
 from fgreg.graph.expectation_propagation import settle
 from fgreg.graph.packing import PackedProblem, pack_pairs
 from fgreg.graph.reduced_blocks import initial_private, times
-from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
+from fgreg.graph.reduced_graph import Evaluation, evaluate
+from fgreg.graph.reduced_system import refine
 from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.graph.shared_state import SharedState, gaussian_prior
 from fgreg.model.estimate import TrackEstimate, Verdict
