@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -49,6 +50,24 @@ Work = Callable[[Request], Answer]
 Kind = Literal["ready", "ping", "request", "failed", "broken"]
 """Kind of a message. To the process: ping, request. From it: their answers, ``ready`` to work, a ``failed`` request,
 and ``broken`` with the reason why it ends. The message None ends the process."""
+
+
+_preloaded = False
+
+
+def preload(*modules: str) -> None:
+    """Import modules once for all workers that this process starts from now on (Linux).
+
+    Most of a worker's start are its imports. A server process without threads imports them, and each worker is a fork
+    of it (multiprocessing's forkserver); workers that these start themselves are not. Has no effect later than the
+    first worker of that kind.
+    """
+    global _preloaded
+    if sys.platform == "linux":
+        from multiprocessing import set_forkserver_preload  # imported late to keep the cold start short
+
+        set_forkserver_preload([*modules])
+        _preloaded = True
 
 
 class WorkerProcess(Generic[Request, Answer]):
@@ -280,7 +299,8 @@ class _Child:
         import multiprocessing  # imported late to keep the cold start short
         from multiprocessing import resource_tracker
 
-        context = multiprocessing.get_context("spawn")  # a fork would inherit the threads of libraries in any state
+        # A fork of this process would inherit the threads of libraries in any state.
+        context: Any = multiprocessing.get_context("forkserver" if _preloaded else "spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, *arguments), name=name, daemon=daemon)
         # The process starts with SIGINT blocked: its owner ends it. The tracker's start would unblock it again.
