@@ -210,6 +210,7 @@ def make_pictures(making: Making, processes: int) -> bool:
     if making.path.is_file() and _holds(making, room):
         return False
     part = replace(making, path=making.path.with_suffix(".part"))
+    part.path.parent.mkdir(parents=True, exist_ok=True)
     part.file(room, "w+")
     numbers = range(len(room.clips()))
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
