@@ -28,7 +28,7 @@ from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, Snapsh
 from fgreg.online.snapshot_record import Layout
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
-from fgreg.workers.worker_process import Work, WorkerProcess
+from fgreg.workers.worker_process import Work, WorkerProcess, preload
 
 ANSWER_S, END_S = 60.0, 5.0
 """A process that takes longer for a call, or to end, is killed; the longest call restores a session in some seconds."""
@@ -214,11 +214,13 @@ class _Registering:
         except EventRefused as error:
             refused = error.reason
         finally:
-            self._publish()
+            if self._restoring is None:  # until then the snapshot of the process before is better
+                self._publish()
         return refused, value, self._engine.estimate, self._engine.moves, self._engine.loop_closures
 
     def idle(self) -> None:
         """Take over the full solve's result while no event comes."""
+        preload("fgreg.online.solver")  # for a full solve's process that follows one that has ended
         if self._restoring is None:
             self._engine.refresh()
         self._publish()
