@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import TracebackType
@@ -200,11 +201,16 @@ def _registering(model: SessionModel, config: SolveConfig) -> Iterator[Work[Call
         yield _Registering(engine, shared)
 
 
+SETTLED_S = 10.0
+"""Time after the start when the other processes of a session have started, too, and no longer need the processors."""
+
+
 class _Registering:
     def __init__(self, engine: OnlineRegistration, shared: SharedSnapshot) -> None:
         self._engine, self._shared = engine, shared
         self._published: OnlineEstimate | None = None
         self._restoring: Any = None
+        self._settled_s = time.monotonic() + SETTLED_S
         self._publish()
 
     def __call__(self, call: Call) -> After:
@@ -220,7 +226,8 @@ class _Registering:
 
     def idle(self) -> None:
         """Take over the full solve's result while no event comes."""
-        preload("fgreg.online.solver")  # for a full solve's process that follows one that has ended
+        if time.monotonic() > self._settled_s:
+            preload("fgreg.online.solver")  # for a full solve's process that follows one that has ended
         if self._restoring is None:
             self._engine.refresh()
         self._publish()
