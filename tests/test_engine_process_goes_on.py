@@ -26,6 +26,7 @@ from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import OnlineEvent
 from fgreg.online.live_session import MOST_DEATHS, LiveSession
+from fgreg.session.journal import Journal
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
@@ -168,10 +169,10 @@ def test_a_restart_that_fails_half_way_counts_nothing_twice_and_blames_no_event(
             live.add(events[14])
         with monkeypatch.context() as broken:
 
-            def no_memory() -> object:
+            def no_memory(_journal: Journal) -> object:
                 raise FgregError("out of memory")
 
-            broken.setattr(live.journal, "reread", no_memory)
+            broken.setattr(Journal, "events", property(no_memory))
             for _ in range(MOST_DEATHS + 1):
                 with pytest.raises(FgregError, match="out of memory"):
                     live.revive()

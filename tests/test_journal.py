@@ -173,7 +173,7 @@ def test_a_line_cut_short_anywhere_is_dropped_with_a_warning_and_recording_goes_
     for cut in [*range(first + 1, len(whole) - 1, 37), len(whole) - 2]:
         path.write_bytes(whole[:cut])
         with Journal.open(folder) as journal:
-            assert len(journal.take_recorded()) == 1
+            assert len(journal.events) == 1
             assert any("cut short" in warning for warning in journal.warnings)
             journal.append(NoteEvent(0.5, 0, "on"))
         assert path.read_bytes().startswith(whole[:first])

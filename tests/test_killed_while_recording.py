@@ -16,7 +16,7 @@ def test_eighty_kills_lose_no_acknowledged_event(tmp_path: Path) -> None:
     for folder in toll.sessions:
         with Journal.open(folder) as journal:
             lines = journal.lines
-            assert len(journal.take_recorded()) == lines
+            assert len(journal.events) == lines
             journal.append(event_at(tmp_path / "template", lines))
         assert count_events(folder) == lines + 1
 

@@ -200,7 +200,7 @@ class LiveSession:
         try:
             found = cls(journal, make_engine or online_engine, config or SolveConfig())
             found.late = late
-            found._take_up(journal.take_recorded())
+            found._take_up(journal.events)
         except BaseException:
             journal.close()
             raise
@@ -224,7 +224,7 @@ class LiveSession:
                 self._refuse(event, event.line, f"the registration's process has ended {MOST_DEATHS} times at it")
         self._write_waiting(patient=False)
         self._begin_with(self._make_engine(self.journal.model, self.config))
-        self._take_up(self.journal.reread())
+        self._take_up(self.journal.events)
         self._untaken.clear()
         self._gone = False
         self._write_waiting()

@@ -84,7 +84,7 @@ def record_choice(
     with Journal.open(folder) as journal:
         for text in journal.warnings:
             warn(text)
-        events = list(journal.take_recorded())
+        events = journal.events
         out = excluded_shots(events).values()
         if include:
             _present("--pm", names.pms, {shot.pm for shot in out}, "a PM that is left out")
@@ -92,8 +92,9 @@ def record_choice(
             _present("--point", names.points, {shot.point for shot in out}, "a known point that is left out")
         kind, t = IncludeEvent if include else ExcludeEvent, journal.last_t or 0.0
         chosen = [kind(t, 0, pm, line, reason, by) for pm, line, _ in _chosen(events, names, "--")]
-        events += [journal.append(event).event for event in chosen]
-        return tuple(excluded_shots(events).values())
+        for event in chosen:
+            journal.append(event)
+        return tuple(excluded_shots(journal.events).values())
 
 
 def _chosen(events: Sequence[Event], names: ShotNames, prefix: str) -> list[tuple[int | None, int | None, str]]:

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Self
 
 from fgreg.errors import InputError, JournalError
-from fgreg.model.events import Event
+from fgreg.model.events import Event, StageEvent, TrackEvent
 from fgreg.model.session_model import SessionModel
 from fgreg.output.atomic_file import FileKind, write_file
 from fgreg.output.session_folder import CUT_SUFFIX
@@ -53,7 +53,8 @@ class Journal:
         self, folder: Path, model: SessionModel, setup: Setup, file: AppendFile, recorded: Session, warnings: list[str]
     ) -> None:
         self.folder, self.model, self.warnings = folder, model, tuple(warnings)
-        self._setup, self._file, self._recorded = setup, file, recorded.events
+        self._setup, self._file = setup, file
+        self._events = [event for event in recorded.events if not isinstance(event, StageEvent | TrackEvent)]
         self._seen = ShotsSeen()
         for event in recorded.events:
             self._seen.add(event)
@@ -99,19 +100,10 @@ class Journal:
         """Events on disk."""
         return 0 if self._seen.last is None else self._seen.last[1]
 
-    def take_recorded(self) -> tuple[Event, ...]:
-        """The events that were in the file at opening; the journal releases them."""
-        events, self._recorded = self._recorded, ()
-        return events
-
-    def reread(self) -> tuple[Event, ...]:
-        """All events that are recorded, from the file; others may be appended meanwhile.
-
-        Raises:
-            InputError: another program has changed the session's files.
-        """
-        lines = self.lines
-        return read_session(self.folder).events[:lines]
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """The recorded events, without the stage's and queries: they are many, and no estimate depends on them."""
+        return tuple(self._events)
 
     def append(self, event: Event, *, durable: bool = True, late: bool = False) -> Appended:
         """Append an event to the file and flush it to disk; its ``line`` is set here.
@@ -143,6 +135,8 @@ class Journal:
             self._sync_frames({use.path for use in frames})
             offset = self._file.append(line, durable=durable)
             self._seen.add(read.event)
+            if not isinstance(read.event, StageEvent | TrackEvent):
+                self._events.append(read.event)
             return Appended(offset, read.event)
 
     def _sync_frames(self, frames: set[Path]) -> None:
