@@ -105,6 +105,23 @@ def test_every_kind_of_event_is_read_back_bit_by_bit(folder: Path) -> None:
         assert event_line(event_document(before, folder), "") == event_line(event_document(after, folder), "")
 
 
+def test_events_without_effect_on_the_estimate_are_not_kept_in_memory(folder: Path) -> None:
+    rng = np.random.default_rng(7)
+    given = [
+        pair(rng, 1.0),
+        StageEvent(1.1, 0, "home"),
+        TrackEvent(1.2, 0, pose(rng), scan_deg=0.1),
+        NoteEvent(1.3, 0, "here"),
+    ]
+    with Journal.open(folder) as journal:
+        for event in given:
+            journal.append(event)
+        kept = journal.events
+    with Journal.open(folder) as journal:
+        for events in (kept, journal.events):
+            assert [(type(event), event.line) for event in events] == [(PairEvent, 1), (NoteEvent, 4)]
+
+
 def test_the_file_holds_the_very_doubles_that_were_given(folder: Path) -> None:
     event = pair(np.random.default_rng(2), 1 / 3)
     with Journal.open(folder) as journal:
