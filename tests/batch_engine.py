@@ -126,5 +126,8 @@ class BatchEngine:
     def solution(self) -> Solution:
         return solve(self.all, (), self.model, self.config)
 
+    def starts(self) -> tuple[EpochStart, ...]:
+        return self.measurements().epochs
+
     def measurements(self) -> Measurements:
         return self.all

@@ -107,7 +107,7 @@ def test_every_kind_of_event_is_read_back_bit_by_bit(folder: Path) -> None:
 
 def test_events_without_effect_on_the_estimate_are_not_kept_in_memory(folder: Path) -> None:
     rng = np.random.default_rng(7)
-    given = [
+    given: list[Event] = [
         pair(rng, 1.0),
         StageEvent(1.1, 0, "home"),
         TrackEvent(1.2, 0, pose(rng), scan_deg=0.1),

@@ -35,6 +35,7 @@ from fgreg.live.launch import EngineProcesses, LiveSetup, Running, make_folder, 
 from fgreg.live.loop import IDLE_S
 from fgreg.live.simulated_room import room_setup, simulated_room
 from fgreg.live.viewer_feed import viewer_feed
+from fgreg.model.events import PairEvent
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.live_session import LiveSession
 from fgreg.simulation.documents import session_document
@@ -112,7 +113,8 @@ def made_up(hours: float, folder: Path, seed: int, memory: Memory) -> bool:
                 said = rehearsal.messages[-1][1].text if rehearsal.messages else "nothing"
                 for notes in (rehearsal.messages, rehearsal.actions, rehearsal.errors_deg, told.events, told.estimates):
                     notes.clear()
-                looks, epochs = len(session.measurements().pairs), len(session.measurements().epochs)
+                looks = sum(isinstance(event, PairEvent) for event in session.journal.events)
+                epochs = len(session.engine.starts())
                 size_mb, took = (folder / "events.jsonl").stat().st_size / 1e6, time.monotonic() - began
                 print(
                     f"  minute {minute:.0f}: {looks} looks, {epochs} epochs, events.jsonl {size_mb:.1f} MB, "

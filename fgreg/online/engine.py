@@ -500,6 +500,10 @@ class OnlineRegistration:
         """All measurements, as the batch solve takes them."""
         return self._state.measurements()
 
+    def starts(self) -> tuple[EpochStart, ...]:
+        """Starts of the camera epochs."""
+        return tuple(epoch.start for epoch in self._state.epochs)
+
     def marker_T_laser(self) -> FloatArray | None:
         """(4, 4) the current estimate of the beam, origin by its chart; None where there is none yet."""
         if self._state.active_window is None:

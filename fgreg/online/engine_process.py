@@ -19,7 +19,7 @@ from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
 from fgreg.errors import EventRefused, FgregError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import TrackEstimate
-from fgreg.model.measurements import Measurements, Track
+from fgreg.model.measurements import EpochStart, Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
@@ -136,6 +136,10 @@ class EngineProcess:
         if not isinstance(found, Measurements):
             raise TypeError(f"the process answered with a {type(found).__name__}")
         return found
+
+    def starts(self) -> tuple[EpochStart, ...]:
+        """Starts of the camera epochs. Raises EngineGone."""
+        return tuple(self._call("starts"))
 
     def marker_T_laser(self) -> FloatArray | None:
         """The beam, (4, 4); None where there is no estimate yet. Raises EngineGone."""

@@ -66,6 +66,7 @@ class Engine(Protocol):
     def settle(self) -> OnlineEstimate: ...
     def refresh(self) -> OnlineEstimate: ...
     def measurements(self) -> Measurements: ...
+    def starts(self) -> tuple[EpochStart, ...]: ...
     def marker_T_laser(self) -> FloatArray | None: ...
     def restoring(self) -> AbstractContextManager[None]: ...
     def snapshot(self) -> Snapshot | None: ...
@@ -122,13 +123,9 @@ class EpochFeed:
         began = max(0, estimate.epoch - self.epoch)
         self.noticed += began
         if began:
-            for number, start in enumerate(self.starts()[self.epoch + 1 :], self.epoch + 1):
+            for number, start in enumerate(self._engine.starts()[self.epoch + 1 :], self.epoch + 1):
                 self._checks.moved(start.t, number)
         self.epoch = estimate.epoch
-
-    def starts(self) -> tuple[EpochStart, ...]:
-        """Starts of the engine's epochs."""
-        return self._engine.measurements().epochs
 
 
 class LiveSession:
@@ -438,7 +435,7 @@ class LiveSession:
             return
         self._closures = len(closures)
         self._unwritten.extend(NoteEvent(t, 0, closure.text) for closure in closures[before:])
-        for start in self._feed.starts()[-count:] if count else ():
+        for start in self._engine.starts()[-count:] if count else ():
             moved = CameraMovedEvent(
                 t, 0, start.camera_new_T_camera_old, start.covariance, detected=True, since_t=min(t, start.t)
             )
