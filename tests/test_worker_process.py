@@ -39,8 +39,6 @@ def _answer(request: Any) -> Any:
             return lambda: None
         case "pid":
             return os.getpid()
-        case "owner and imports":
-            return os.getppid(), "colorsys" in sys.modules
         case "nice":
             return os.nice(0)
         case float() if request < 0:
@@ -286,44 +284,27 @@ def test_ctrl_c_is_not_for_workers(start: Callable[..., Worker]) -> None:
 
 
 OWNER = """
-import os, signal, sys, time
-from fgreg.workers.worker_process import WorkerProcess, preload
+import sys, time
+from fgreg.workers.worker_process import WorkerProcess
 from tests.test_worker_process import halving
 if __name__ == "__main__":
-    if "preload" in sys.argv:
-        preload("colorsys")
     worker = WorkerProcess(halving, name="halving", what="the halving process")
     worker.send("pid")
     print(worker.fetch(60.0)[0], flush=True)
-    if "preload" in sys.argv:
-        worker.send("owner and imports")
-        (owner, imported), = worker.fetch(60.0)
-        assert owner != os.getpid() and imported
-        first = worker.pid
-        os.kill(first, signal.SIGINT)
-        os.kill(first, signal.SIGKILL)
-        worker.send("pid")
-        while (found := worker.fetch(60.0)[0]) is None:
-            worker.send("pid")
-        print(found, flush=True)
     if "busy" in sys.argv:
         worker.send(bytes(3_000_000))
     time.sleep(60.0)
 """
 
 
-@pytest.mark.parametrize("state", ["idle", "busy", "preload"])
+@pytest.mark.parametrize("state", ["idle", "busy"])
 def test_a_worker_ends_with_an_owner_that_is_killed(tmp_path: Path, state: str) -> None:
-    """With preloaded imports a worker is a fork of the server that has them, and so is the next after a killed one."""
     (tmp_path / "owner.py").write_text(OWNER)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
     command = [sys.executable, str(tmp_path / "owner.py"), state]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as owner:
         assert owner.stdout is not None
         pid = int(owner.stdout.readline())
-        if state == "preload":
-            first, pid = pid, int(owner.stdout.readline())
-            assert pid != first
         owner.kill()
         owner.wait()
 

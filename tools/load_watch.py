@@ -27,7 +27,7 @@ BUSY_S = 1.0
 GROWS_FROM_MIN = 4
 """By then the stage follows, and everything that a session uses has been loaded."""
 TINY_S = 1e-4
-TRACKER, FORK_SERVER = "resource tracker", "fork server"
+TRACKER = "resource tracker"
 
 
 def percentiles(values: list[float]) -> dict[str, float]:
@@ -337,15 +337,13 @@ class Processes:
         return out
 
     def left(self) -> list[str]:
-        """Processes that still run, without this one and those that Python itself ends with it."""
+        """Processes that still run, without this one and Python's resource tracker."""
         own = os.getpid()
         mine = {pid for pid, parent in _parents().items() if parent == own}
         return [
             process.name
             for pid, process in self._found.items()
-            if pid != own
-            and _started(pid) == process.started
-            and not (process.name in (TRACKER, FORK_SERVER) and pid in mine)
+            if pid != own and _started(pid) == process.started and not (process.name == TRACKER and pid in mine)
         ]
 
 
@@ -388,6 +386,4 @@ def _name(pid: int) -> str:
     for part, name in (("fgreg.stage.watchdog", "watchdog"), ("resource_tracker", TRACKER)):
         if part in words:
             return name
-    if "multiprocessing.forkserver" in words and not shown.startswith("fgreg-"):  # its forks have their own names
-        return FORK_SERVER
     return shown.removeprefix("fgreg-")

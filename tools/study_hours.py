@@ -26,7 +26,6 @@ from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
-from multiprocessing.util import get_temp_dir
 from pathlib import Path
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
@@ -221,7 +220,6 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     memory = Memory()
-    get_temp_dir()  # of multiprocessing, which removes it at the end: later than the one below
     with tempfile.TemporaryDirectory(prefix="hours-") as place:
         folder = Path(place)
         os.environ["TMPDIR"] = tempfile.tempdir = place  # what is left there is ours

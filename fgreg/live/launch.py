@@ -37,7 +37,6 @@ from fgreg.stage.reconnect import ReconnectingStage
 from fgreg.stage.stop_on_exit import emergency_stop_all
 from fgreg.workers.progress import Progress
 from fgreg.workers.threads import undisturbed
-from fgreg.workers.worker_process import preload
 
 MOST_WORK_S = 10.0
 """A registration without a new snapshot for longer is lost, also where its process still works: camera moves would go
@@ -84,10 +83,6 @@ class LiveSetup:
     latencies: Latencies = field(default_factory=Latencies)
     write_truth: WriteTruth | None = None
     rig_file: Path | None = None
-
-
-WORKERS = ("fgreg.online.engine_process", "fgreg.live.view_worker", "fgreg.live.pa_worker")
-"""Modules that the session's worker processes import."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,7 +194,6 @@ def running(
         FgregError: a part did not start.
     """
     make_folder(folder, live.setup, live.rig_file)
-    preload(*WORKERS)
     with ExitStack() as stack:
         say("starting the registration")
         make_engine = EngineProcesses()

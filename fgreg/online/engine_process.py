@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import TracebackType
@@ -29,7 +28,7 @@ from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, Snapsh
 from fgreg.online.snapshot_record import Layout
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
-from fgreg.workers.worker_process import Work, WorkerProcess, preload
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S, END_S = 60.0, 5.0
 """A process that takes longer for a call, or to end, is killed; the longest call restores a session in some seconds."""
@@ -205,16 +204,11 @@ def _registering(model: SessionModel, config: SolveConfig) -> Iterator[Work[Call
         yield _Registering(engine, shared)
 
 
-SETTLED_S = 10.0
-"""Time after the start when the other processes of a session have started, too, and no longer need the processors."""
-
-
 class _Registering:
     def __init__(self, engine: OnlineRegistration, shared: SharedSnapshot) -> None:
         self._engine, self._shared = engine, shared
         self._published: OnlineEstimate | None = None
         self._restoring: Any = None
-        self._settled_s = time.monotonic() + SETTLED_S
         self._publish()
 
     def __call__(self, call: Call) -> After:
@@ -230,11 +224,9 @@ class _Registering:
 
     def idle(self) -> None:
         """Take over the full solve's result while no event comes."""
-        if time.monotonic() > self._settled_s:
-            preload("fgreg.online.solver")  # for a full solve's process that follows one that has ended
         if self._restoring is None:
             self._engine.refresh()
-        self._publish()
+            self._publish()
 
     def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
         match name:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -50,26 +49,6 @@ Work = Callable[[Request], Answer]
 Kind = Literal["ready", "ping", "request", "failed", "broken"]
 """Kind of a message. To the process: ping, request. From it: their answers, ``ready`` to work, a ``failed`` request,
 and ``broken`` with the reason why it ends. The message None ends the process."""
-
-
-_preloaded = False
-
-
-def preload(*modules: str) -> None:
-    """Import modules once for all workers that this process starts from now on (Linux).
-
-    Most of a worker's start are its imports. A server process without threads imports them, from now on, and each
-    worker is a fork of it (multiprocessing's forkserver); the next one waits until it has. Workers that a worker starts
-    are forks only if it calls this itself. A later call has no effect.
-    """
-    global _preloaded
-    if sys.platform == "linux" and not _preloaded:
-        from multiprocessing import forkserver  # imported late to keep the cold start short
-
-        forkserver.set_forkserver_preload([*modules])
-        with _interrupts_blocked():
-            forkserver.ensure_running()
-        _preloaded = True
 
 
 class WorkerProcess(Generic[Request, Answer]):
@@ -271,19 +250,6 @@ class WorkerProcess(Generic[Request, Answer]):
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Processes that start in the block never get Ctrl-C: their owner ends them."""
-    from multiprocessing import resource_tracker
-
-    resource_tracker.ensure_running()  # its start would unblock it again
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-@contextmanager
 def _interrupts_held() -> Iterator[None]:
     """Ctrl-C takes effect when the block ends: a process that is half started would end with a traceback.
 
@@ -312,17 +278,22 @@ class _Child:
 
     def __init__(self, arguments: tuple[Any, ...], name: str, daemon: bool) -> None:
         import multiprocessing  # imported late to keep the cold start short
+        from multiprocessing import resource_tracker
 
-        # A fork of this process would inherit the threads of libraries in any state.
-        context: Any = multiprocessing.get_context("forkserver" if _preloaded else "spawn")
+        context = multiprocessing.get_context("spawn")  # a fork would inherit the threads of libraries in any state
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, *arguments), name=name, daemon=daemon)
+        # The process starts with SIGINT blocked: its owner ends it. The tracker's start would unblock it again.
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            with theirs, _interrupts_blocked(), _interrupts_held():
+            with theirs, _interrupts_held():
                 self.process.start()
         except OSError:
             self.connection.close()
             raise
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._messages: SimpleQueue[memoryview | None] = SimpleQueue()
         self._writer = threading.Thread(target=self._write, name=f"to {name}", daemon=True)
         self._writer.start()
