@@ -23,7 +23,7 @@ from fgreg.camera_moves.loop_closure import back_to
 from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
 from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray, make_transform, rotation_to_direction
-from fgreg.graph.shared_state import Quadratic, SharedState
+from fgreg.graph.shared_state import Quadratic
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.measurements import Aim, EpochStart, KnownPoint, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
@@ -45,7 +45,7 @@ from fgreg.registration.epochs import FinishedEpochs, last_epoch
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.solve import Solution, solve
 from fgreg.smoother.initialise import initialised
-from fgreg.smoother.innovation import misplaced_pms, sigma_distance
+from fgreg.smoother.innovation import misplaced_pms
 from fgreg.smoother.marginal_prior import has_moved
 from fgreg.smoother.state import Epoch, State, finished_prior, make_setting
 from fgreg.smoother.updates import (
@@ -62,11 +62,6 @@ MOST_LOSSES = 3
 """Times that a case is submitted again after its worker process has ended, until the next event."""
 MOST_ROUNDS = 4
 """Largest number of full solves at one event: after each camera move that one finds another follows."""
-
-
-TESTED_SIGMA = 0.5
-"""All PMs of the epoch are tested again after the estimate has moved by so much, in its own standard deviations: the
-root of a PM's innovation (a chi square) changes by no more than that."""
 
 
 class OnlineRegistration:
@@ -109,7 +104,6 @@ class OnlineRegistration:
         self._draft: tuple[int, EpochSearch] | None = None  # of a full solve that has to follow: serial, minima
         self._solve_wanted = self._move_wanted = self._move_untested = False
         self._misplaced: frozenset[int] = frozenset()
-        self._tested: SharedState | None = None  # the estimate at which all PMs of the epoch were tested last
         self._restoring = False
         self._report: Report | None = None
         self._snapshot: tuple[OnlineEstimate, Snapshot] | None = None
@@ -187,25 +181,14 @@ class OnlineRegistration:
         return monitored(self._tags, event.t, TagFrame(event.camera_T_tag, event.covariance), TagSettings())
 
     def _misplaced_now(self, state: State, event: OnlineEvent) -> frozenset[int]:
-        """PMs of the state that are inliers beyond their limit, or outliers within it; none where no shot was added.
-
-        Those that were known where the estimate is still near the one at which all were tested.
-        """
-        active = state.active_window
-        if not isinstance(event, Pair | Aim | KnownPoint) or active is None:
-            return frozenset()
-        if self._tested is not None:
-            moved = sigma_distance(self._tested, active.state, active.covariance, self._setting.columns)
-            if moved < TESTED_SIGMA:
-                return self._misplaced
-        found, self._tested = misplaced_pms(state, self._setting), active.state
-        return found
+        """PMs of the state that are inliers beyond their limit, or outliers within it; none where no shot was added."""
+        return misplaced_pms(state, self._setting) if isinstance(event, Pair | Aim | KnownPoint) else frozenset()
 
     def _divided(self, *, by_tags: bool = False) -> None:
         """Note that the division of the pairs into epochs has changed: results of earlier cases are invalid."""
         self._division += 1
         self._proofs.forget()
-        self._misplaced, self._tested, self._finished_prior = frozenset(), None, None
+        self._misplaced, self._finished_prior = frozenset(), None
         if self._state.epoch_pairs:  # the epoch before has other pairs now
             self._solved = min(self._solved, self._state.epoch - 1)
         if not by_tags:
@@ -349,9 +332,7 @@ class OnlineRegistration:
                 self._state = initialised(self._state, found.initial, self._setting)
                 # Pairs that came before the first registration have not been tested for a move yet.
                 self._move_wanted, self._move_untested = self._move_wanted or self._move_untested, False
-                active = self._state.active_window
                 self._misplaced = misplaced_pms(self._state, self._setting)
-                self._tested = None if active is None else active.state
                 if self._draft is None:
                     self._solved, self._reports = found.epoch + 1, () if found.report is None else found.report.epochs
                 prior, here = self._finished_prior, self._state.active_window
