@@ -71,6 +71,15 @@ def test_innovations_need_no_other_epochs_variables(shared: bool) -> None:
     np.testing.assert_allclose(innovations(problem, parts, inlier, aims).pm, expected, rtol=1e-5)
 
 
+def test_an_epoch_without_pms_has_its_columns() -> None:
+    problem, _, _ = _three_epochs(shared=False)
+    none = np.zeros(0, dtype=np.int64)
+    common = list(range(18, problem.columns.size))
+    assert list(pm_columns(problem, none)) == common
+    assert list(pm_columns(problem, none, 1)) == [*range(6, 12), *common]
+    assert list(pm_columns(problem, np.array([0]), 0)) == [*range(6), *common]
+
+
 def test_variables_that_are_eliminated_leave_the_covariance_of_the_rest() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(9, 9)) * np.geomspace(1e-3, 1e3, 9)

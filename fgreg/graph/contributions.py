@@ -124,10 +124,13 @@ def contributions(problem: PackedProblem, state: SharedState, private: PrivateSt
     )
 
 
-def pm_columns(problem: PackedProblem, pms: IntArray) -> IntArray:
-    """(K,) columns of the shared variables on which PMs depend: of the epochs they are in, the beam's and the rig's."""
+def pm_columns(problem: PackedProblem, pms: IntArray, *also: int) -> IntArray:
+    """(K,) columns of the shared variables on which PMs depend: of the epochs they are in, the beam's and the rig's.
+
+    ``also``: epochs whose columns are wanted even where the PMs are none.
+    """
     columns = problem.columns
-    epochs = np.unique(problem.beam_epoch[np.isin(problem.beam_pm, pms)])
+    epochs = np.union1d(problem.beam_epoch[np.isin(problem.beam_pm, pms)], also).astype(np.int64)
     poses = (6 * epochs[:, None] + np.arange(6)).reshape(-1)
     return np.concatenate([poses, np.arange(columns.beam, columns.size)])
 

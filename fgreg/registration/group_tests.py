@@ -54,7 +54,7 @@ def group_conditions(problem: PackedProblem, optimum: Optimum, covariance: Float
     if not partings:
         return []
     parts = contributions(problem, optimum.state, optimum.evaluation.private).pm
-    columns = pm_columns(problem, mine)
+    columns = pm_columns(problem, mine, epoch)
     pose = np.flatnonzero((columns >= 6 * epoch) & (columns < 6 * epoch + 6))
     gradient, hessian = parts.gradient[0, mine][:, columns[pose]], parts.hessian(mine, columns)[0][:, pose]
     covariance = covariance[np.ix_(columns, columns)]

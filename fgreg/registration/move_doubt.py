@@ -84,7 +84,7 @@ def moves_in_epoch(
     mine = np.unique(problem.beam_pm[problem.beam_epoch == place])
     mine = mine if outliers else mine[shots.pm_inlier[mine]]
     parts = contributions(problem, optimum.state, shots.evaluation.private).pm
-    columns = pm_columns(problem, mine)
+    columns = pm_columns(problem, mine, place)
     out = ~shots.pm_inlier[mine]
     cost = parts.cost[0, mine]
     weight = np.where(out, np.minimum(pm_limits(problem)[mine] / np.maximum(cost, 1e-12), 1.0), 1.0)
