@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.errors import EventRefused
+from fgreg.errors import EventRefused, FgregError
+from fgreg.live.launch import EngineProcesses
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -129,5 +130,60 @@ def test_one_that_hangs_is_killed(case: Case, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_model_that_no_engine_takes_is_said() -> None:
-    with pytest.raises(EngineGone, match="AttributeError"):
+    with pytest.raises(FgregError, match="AttributeError"):
         EngineProcess(None, SolveConfig())  # type: ignore[arg-type]
+
+
+def engine_pids() -> set[int | None]:
+    return {child.pid for child in multiprocessing.active_children() if child.name == "fgreg-engine"}
+
+
+@pytest.fixture
+def engines() -> Iterator[EngineProcesses]:
+    others, found = engine_pids(), EngineProcesses()
+    yield found
+    found.close()
+    assert engine_pids() <= others
+
+
+def started_spare(engines: EngineProcesses, model: SessionModel) -> int:
+    """Process id of the spare process that is started now."""
+    before = engine_pids()
+    for _ in range(2):
+        engines.keep_spare(model, SolveConfig())
+    (found,) = engine_pids() - before
+    assert found is not None
+    return found
+
+
+def kill(pid: int) -> None:
+    os.kill(pid, signal.SIGKILL)
+    os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+
+
+def test_the_next_engine_is_in_the_spare_process(case: Case, engines: EngineProcesses) -> None:
+    model, config = case[0], SolveConfig()
+    first = engines(model, config)
+    spare = started_spare(engines, model)
+    assert first.pid is not None
+    kill(first.pid)
+    second = engines(model, config)
+    assert second.pid == spare
+    second.add(case[1].aims[0])
+    assert len(second.measurements().aims) == 1
+
+
+def test_a_spare_process_that_has_ended_or_is_of_other_settings_is_not_used(
+    case: Case, engines: EngineProcesses
+) -> None:
+    model, config = case[0], SolveConfig()
+    engines(model, config)
+    kill(started_spare(engines, model))
+    spare = started_spare(engines, model)
+    kill(spare)
+    engine = engines(model, config)
+    engine.add(case[1].aims[0])
+    spare = started_spare(engines, model)
+    engine = engines(model, replace(config, limit_mm=2.0))
+    assert engine.pid != spare
+    assert spare not in engine_pids()

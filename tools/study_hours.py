@@ -37,6 +37,7 @@ from fgreg.live.simulated_room import room_setup, simulated_room
 from fgreg.live.viewer_feed import viewer_feed
 from fgreg.model.events import PairEvent
 from fgreg.model.solve_config import SolveConfig
+from fgreg.online.engine_process import EngineProcess
 from fgreg.online.live_session import LiveSession
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
@@ -186,7 +187,8 @@ def _kill(session: Running, name: str, run: Callable[..., bool]) -> bool:
     if not before:
         print(f"  {name}: not there, nothing killed    target: it is there")
         return False
-    pid = before[-1]
+    engine = session.session.engine
+    pid = (engine.pid if name == "engine" and isinstance(engine, EngineProcess) else None) or before[-1]  # no spare
     frames, began = session.loop.figures.frames, time.monotonic()
     os.kill(pid, signal.SIGKILL)
 

@@ -23,7 +23,7 @@ from fgreg.live.workflow import Workflow, WorkflowSettings
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.time_sync import Latencies
-from fgreg.online.engine_process import EngineProcess
+from fgreg.online.engine_process import After, Call, EngineProcess, start_process
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import Engine, LiveSession
 from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
@@ -37,6 +37,7 @@ from fgreg.stage.reconnect import ReconnectingStage
 from fgreg.stage.stop_on_exit import emergency_stop_all
 from fgreg.workers.progress import Progress
 from fgreg.workers.threads import undisturbed
+from fgreg.workers.worker_process import WorkerProcess
 
 MOST_WORK_S = 10.0
 """A registration without a new snapshot for longer is lost, also where its process still works: camera moves would go
@@ -97,20 +98,47 @@ class Running:
 
 
 class EngineProcesses:
-    """Starts engine processes, one at a time: starting one ends the one before."""
+    """Starts engine processes, one at a time: starting one ends the one before. For one thread."""
 
     def __init__(self) -> None:
         self._engine: EngineProcess | None = None
+        self._spare: tuple[SessionModel, SolveConfig, WorkerProcess[Call, After]] | None = None
 
     def __call__(self, model: SessionModel, config: SolveConfig) -> EngineProcess:
-        self.close()
-        self._engine = EngineProcess(model, config)
-        return self._engine
-
-    def close(self) -> None:
-        """End the last process."""
         if self._engine is not None:
             self._engine.close()
+            self._engine = None
+        self._engine = EngineProcess(model, config, self._take_spare(model, config))
+        return self._engine
+
+    def keep_spare(self, model: SessionModel, config: SolveConfig) -> None:
+        """Have a process ready for the next engine: its start, mostly imports, takes a second or two. Call it often."""
+        if self._spare is not None:
+            process = self._spare[2]
+            process.check()
+            if process.alive and not process.trouble:
+                return
+            process.close()
+        self._spare = model, config, start_process(model, config)
+
+    def _take_spare(self, model: SessionModel, config: SolveConfig) -> WorkerProcess[Call, After] | None:
+        """The spare process, if it is healthy and has this model and configuration."""
+        if self._spare is None:
+            return None
+        (of_model, of_config, process), self._spare = self._spare, None
+        process.check()
+        if of_model is model and of_config == config and process.alive and not process.trouble:
+            return process
+        process.close()
+        return None
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._engine is not None:
+            self._engine.close()
+        if self._spare is not None:
+            self._spare[2].close()
+            self._spare = None
 
 
 class NewestSnapshots:
@@ -212,7 +240,15 @@ def running(
         if devices.overlay:
             overlay = OverlayFeed(model, devices.overlay)
             stack.callback(overlay.close)
-        recorder = Recorder(session, _both(on_taken, overlay))
+
+        def on_event(event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:
+            make_engine.keep_spare(model, session.config)
+            if overlay is not None:
+                overlay.taken(event, estimate, marker_T_laser)
+            if on_taken is not None:
+                on_taken(event, estimate, marker_T_laser)
+
+        recorder = Recorder(session, on_event)
         stack.callback(_end_recording, recorder, say)
         taken = session.measurements()
         workflow = Workflow(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
@@ -228,19 +264,6 @@ def running(
         finally:
             if devices.stage is not None:
                 devices.stage.close()  # first; the rest follows in the stack's order
-
-
-def _both(on_taken: OnTaken | None, overlay: OverlayFeed | None) -> OnTaken | None:
-    """Tells both of an event."""
-    if overlay is None:
-        return on_taken
-
-    def taken(event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:
-        overlay.taken(event, estimate, marker_T_laser)
-        if on_taken is not None:
-            on_taken(event, estimate, marker_T_laser)
-
-    return taken
 
 
 def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from types import TracebackType
 from typing import Any
 
@@ -46,32 +46,45 @@ class EngineGone(FgregError):  # noqa: N818
     """The registration's process has ended; every recorded event is on disk."""
 
 
+def start_process(model: SessionModel, config: SolveConfig) -> WorkerProcess[Call, After]:
+    """A process for an :class:`EngineProcess`. It loads its modules, and makes the engine at the first call."""
+    return WorkerProcess(
+        _registering,
+        model,
+        config,
+        name="fgreg-engine",
+        what="the registration's process",
+        answer_s=ANSWER_S,
+        end_s=END_S,
+        restart=False,  # a new process would have no events: the caller makes another engine from the journal
+        daemon=False,
+    )
+
+
 class EngineProcess:
     """The engine as :class:`fgreg.online.live_session.LiveSession` takes it. Use it as a context manager, or close it.
 
     Calls wait for the process; they may come from several threads and then run one after another.
 
+    Args:
+        model: the session's set-up.
+        config: settings of estimate and verdict.
+        process: of :func:`start_process` with the same model and configuration; None starts one.
+
     Raises:
-        EngineGone: the process did not start.
+        EngineGone: the process did not start, or has ended.
+        FgregError: it cannot make an engine of this model.
     """
 
-    def __init__(self, model: SessionModel, config: SolveConfig) -> None:
+    def __init__(
+        self, model: SessionModel, config: SolveConfig, process: WorkerProcess[Call, After] | None = None
+    ) -> None:
         self._turn = threading.Lock()
         self._name = ""  # of the shared memory
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
         self._loop_closures: tuple[DetectedLoopClosure, ...] = ()
-        self._worker: WorkerProcess[Call, After] = WorkerProcess(
-            _registering,
-            model,
-            config,
-            name="fgreg-engine",
-            what="the registration's process",
-            answer_s=ANSWER_S,
-            end_s=END_S,
-            restart=False,  # a new process would have no events: the caller makes another engine from the journal
-            daemon=False,
-        )
+        self._worker = process or start_process(model, config)
         try:
             self._name = str(self._call("name"))
         except BaseException:
@@ -197,11 +210,27 @@ class EngineProcess:
 @contextmanager
 def _registering(model: SessionModel, config: SolveConfig) -> Iterator[Work[Call, After]]:
     """In the process."""
-    with (
-        OnlineRegistration(model, config, full_solve="worker") as engine,
-        SharedSnapshot(Layout.of(model)) as shared,
-    ):
-        yield _Registering(engine, shared)
+    with ExitStack() as stack:
+        yield _FromFirstCall(model, config, stack)
+
+
+class _FromFirstCall:
+    """Makes the engine at the first call: until then there is no worker process of its own, and nothing to publish."""
+
+    def __init__(self, model: SessionModel, config: SolveConfig, stack: ExitStack) -> None:
+        self._model, self._config, self._stack = model, config, stack
+        self._work: _Registering | None = None
+
+    def __call__(self, call: Call) -> After:
+        if self._work is None:
+            engine = self._stack.enter_context(OnlineRegistration(self._model, self._config, full_solve="worker"))
+            shared = self._stack.enter_context(SharedSnapshot(Layout.of(self._model)))
+            self._work = _Registering(engine, shared)
+        return self._work(call)
+
+    def idle(self) -> None:
+        if self._work is not None:
+            self._work.idle()
 
 
 class _Registering:
