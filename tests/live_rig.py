@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import math
-import multiprocessing
 import os
 import signal
 import time
@@ -28,6 +27,7 @@ from fgreg.live.simulated_room import room_setup
 from fgreg.live.status import Devices
 from fgreg.model.events import NoteEvent
 from fgreg.model.session_model import SessionModel
+from fgreg.online.engine_process import EngineProcess
 from fgreg.session import append_only_file
 from fgreg.simulation.room import room_config
 
@@ -122,7 +122,8 @@ def _pid_of(case: Rig, what: str) -> int:
         pid = case.session.loop.pulse_locator.locator.pid
         assert pid is not None
         return pid
-    (engine,) = [child for child in multiprocessing.active_children() if child.name == "fgreg-engine"]
+    engine = case.session.session.engine
+    assert isinstance(engine, EngineProcess)
     assert engine.pid is not None
     return engine.pid
 
