@@ -18,12 +18,12 @@ from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 
 ALONG = 4
 """Cells along each side of the first cover: 256 cells, of 25 to 47 deg."""
-ROUNDS, ROUNDS_THOROUGH = 6, 15
-"""Largest number of times that the intervals of a cell are narrowed before it is halved."""
-NARROWED, NARROWED_THOROUGH = 0.8, 0.96
+ROUNDS = 15
+"""Largest number of times that a thorough search narrows the intervals of a cell before it is halved."""
+NARROWED = 0.96
 """Intervals that narrow to more than this part of what they were are not narrowed again."""
 EASY = 40_000
-"""Cells times PMs up to which a search is not thorough: with first hits it ends before, and takes half the time."""
+"""Cells times PMs up to which a search is not thorough: with first hits it mostly ends before, and sooner."""
 AT_ONCE = 12_000
 """Number of cells times PMs that are bounded in one call: more do not stay in the cache."""
 NEAR = 0.5
@@ -138,7 +138,7 @@ def _bounded(
 
 def _portion(of: Conditional, cells: Cells, intervals: Intervals, threshold: float, thorough: bool) -> Region:
     rotation, reach = np.einsum("nij,jk->ikn", cells.rotation, of.rotation), cells.reach
-    bounds = narrowed(of, rotation, reach, intervals, threshold, thorough=thorough)
+    bounds = (narrowed if thorough else lower_bounds)(of, rotation, reach, intervals, threshold)
     near = np.flatnonzero(bounds.possible & (bounds.cost > NEAR * threshold))
     if len(near):
         bounds.put(near, sharper_bounds(of, rotation[..., near], reach.take(near), bounds.take(near), threshold))
@@ -146,28 +146,19 @@ def _portion(of: Conditional, cells: Cells, intervals: Intervals, threshold: flo
     return Region(cells.take(index), bounds.take(index))
 
 
-def narrowed(
-    of: Conditional,
-    rotation: FloatArray,
-    reach: Reach,
-    intervals: Intervals,
-    threshold: float,
-    *,
-    thorough: bool = True,
-) -> Bounds:
-    """Bounds of cells, with intervals narrowed as long as that helps; ``thorough``: also PM by PM, and longer."""
-    rounds, part = (ROUNDS_THOROUGH, NARROWED_THOROUGH) if thorough else (ROUNDS, NARROWED)
-    out = lower_bounds(of, rotation, reach, intervals, threshold, pm_by_pm=thorough)
+def narrowed(of: Conditional, rotation: FloatArray, reach: Reach, intervals: Intervals, threshold: float) -> Bounds:
+    """Bounds of cells, PM by PM, with intervals narrowed as long as that helps."""
+    out = lower_bounds(of, rotation, reach, intervals, threshold, pm_by_pm=True)
     index = np.arange(len(reach))
     before = intervals.half[2].sum(axis=0)
-    for _ in range(1, rounds):
+    for _ in range(1, ROUNDS):
         after = out.intervals.half[2].sum(axis=0)[index]
-        index = index[out.possible[index] & (after < part * before)]
+        index = index[out.possible[index] & (after < NARROWED * before)]
         if not len(index):
             break
         known = out.intervals.take(index)
         before = known.half[2].sum(axis=0)
-        again = lower_bounds(of, rotation[..., index], reach.take(index), known, threshold, pm_by_pm=thorough)
+        again = lower_bounds(of, rotation[..., index], reach.take(index), known, threshold, pm_by_pm=True)
         again.cost[:] = np.maximum(again.cost, out.cost[index])
         out.put(index, again)
     return out
@@ -177,7 +168,7 @@ def _ball(of: Conditional, known: Intervals, threshold: float, enough: float) ->
     """The largest radius about the estimate's rotation that is known to hold no lower cost than ``enough``."""
     rotation = np.repeat(of.rotation[..., None], len(BALLS), axis=-1)
     reach = Reach.ball(BALLS)
-    bounds = narrowed(of, rotation, reach, _repeated(known, len(BALLS)), threshold, thorough=False)
+    bounds = lower_bounds(of, rotation, reach, _repeated(known, len(BALLS)), threshold)
     bounds = sharper_bounds(of, rotation, reach, bounds, threshold)
     good = bounds.cost >= enough
     return float(BALLS[good].max()) if good.any() else 0.0
