@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.errors import FgregError
+from fgreg.errors import EventRefused, FgregError
 from fgreg.live import recorder as recorder_module
 from fgreg.live.launch import NewestSnapshots
 from fgreg.live.recorder import ENGINE_ENDED, Recorder
@@ -187,6 +187,39 @@ def test_a_restart_that_fails_half_way_counts_nothing_twice_and_blames_no_event(
     assert not [event for event in read_session(folder).events if isinstance(event, RefusedEvent)]
     with LiveSession.open(folder) as live:
         same(live.settle(), found, 1e-6)
+
+
+@pytest.mark.parametrize("what", ["one is refused", "it ends"])
+def test_recorded_events_that_cannot_be_taken_in_together_are_taken_in_one_by_one(
+    session: tuple[Path, Shots], monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    folder, events = session
+    with processes() as engines, LiveSession.open(folder, make_engine=engines) as live:
+        for event in events[:14]:
+            live.add(event)
+        expected, real = live.settle(), EngineProcess._call
+        calls: list[str] = []
+
+        def call(self: EngineProcess, name: str, *arguments: object) -> object:
+            calls.append(name)
+            if name == "add_all" and what == "it ends":
+                engines.kill()
+            elif name == "add_all":
+                raise EventRefused("for a reason")
+            return real(self, name, *arguments)
+
+        monkeypatch.setattr(EngineProcess, "_call", call)
+        if what == "it ends":
+            with pytest.raises(EngineGone):
+                live.revive()
+        same(live.revive(), expected, 1e-6)
+        assert calls.count("add_all") == 1
+        assert calls.count("add") == 14
+        monkeypatch.undo()
+        calls.clear()
+        same(live.revive(), expected, 1e-6)
+        assert len(engines.made) == 4
+    assert not [event for event in read_session(folder).events if isinstance(event, RefusedEvent)]
 
 
 class Deadly(EngineProcess):

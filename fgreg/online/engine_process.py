@@ -23,7 +23,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import OnlineEvent
+from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader, remove_memory
 from fgreg.online.snapshot_record import Layout
 from fgreg.tracking.query import track
@@ -38,12 +38,19 @@ Call = tuple[str, tuple[Any, ...]]
 After = tuple[str | None, Any, OnlineEstimate | None, tuple[DetectedMove, ...], tuple[DetectedLoopClosure, ...]]
 """Why an event was refused, what the call returned, and the engine's estimate, moves and loop closures."""
 
+AFTER_EACH = (CameraMoved, LoopClosed)
+"""Recorded events after which the epoch may be another one."""
+
 REMEDY = "open the session again"
 GONE = f"the registration's process has ended: {REMEDY}"
 
 
 class EngineGone(FgregError):  # noqa: N818
     """The registration's process has ended; every recorded event is on disk."""
+
+
+class OneRefused(FgregError):  # noqa: N818
+    """Of recorded events that were taken in together, one was refused; take them in one by one, in a new engine."""
 
 
 def start_process(model: SessionModel, config: SolveConfig) -> WorkerProcess[Call, After]:
@@ -80,6 +87,7 @@ class EngineProcess:
         self, model: SessionModel, config: SolveConfig, process: WorkerProcess[Call, After] | None = None
     ) -> None:
         self._turn = threading.Lock()
+        self._together: list[OnlineEvent] | None = None  # events that wait, while a session is restored
         self._name = ""  # of the shared memory
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
@@ -125,8 +133,22 @@ class EngineProcess:
         return value
 
     def add(self, event: OnlineEvent) -> OnlineEstimate:
-        """As :meth:`fgreg.online.engine.OnlineRegistration.add`. Raises EventRefused, EngineGone."""
-        return self._known(self._call("add", event))
+        """As :meth:`fgreg.online.engine.OnlineRegistration.add`. Raises EventRefused, EngineGone, OneRefused."""
+        if self._together is None:
+            return self._known(self._call("add", event))
+        if isinstance(event, AFTER_EACH):
+            self._send_together()
+            return self._known(self._call("add", event))
+        self._together.append(event)
+        return self._known(self._estimate)
+
+    def _send_together(self) -> None:
+        """Take in the events that wait while a session is restored: a call for each would wait for other threads."""
+        events, self._together = self._together, []
+        try:
+            self._call("add_all", events)
+        except EventRefused as error:
+            raise OneRefused(error.reason) from error
 
     def settle(self) -> OnlineEstimate:
         """As :meth:`fgreg.online.engine.OnlineRegistration.settle`. Raises EngineGone."""
@@ -185,6 +207,17 @@ class EngineProcess:
             yield
         finally:
             self._call("restored")
+
+    @contextmanager
+    def restoring_together(self) -> Iterator[None]:
+        """The same with few calls: each one waits for other threads. Raises EngineGone, OneRefused."""
+        with self.restoring():
+            self._together = []
+            try:
+                yield
+                self._send_together()
+            finally:
+                self._together = None
 
     @property
     def estimate(self) -> OnlineEstimate | None:
@@ -261,6 +294,10 @@ class _Registering:
         match name:
             case "name":
                 return self._shared.name
+            case "add_all":
+                for event in arguments[0]:
+                    self._engine.add(event)
+                return None
             case "restore":
                 self._restoring = self._engine.restoring()
                 return self._restoring.__enter__()

@@ -39,7 +39,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.checks import CheckPoints
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.engine_process import GONE, EngineGone
+from fgreg.online.engine_process import GONE, EngineGone, EngineProcess, OneRefused
 from fgreg.online.estimate import OnlineEstimate, with_conditions
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.registration.checks import CHECKS_REFUSE
@@ -150,6 +150,7 @@ class LiveSession:
         self._gone = False  # the engine's process has ended: no event goes into the estimate before a revival
         self._ended_at: Event | None = None  # the event that it ended at
         self._deaths: dict[int, int] = {}  # ends of the engine's process while it took an event in, by its line
+        self._together = True  # whether recorded events are taken in together: one by one, it is known which one fails
         self._begin_with(make_engine(journal.model, config))
 
     def _begin_with(self, engine: Engine) -> None:
@@ -241,18 +242,39 @@ class LiveSession:
 
     def _take_up(self, events: Sequence[Event]) -> None:
         """Take in recorded events, with one estimate at the end."""
-        refused, excluded = refused_lines(events), excluded_shots(events)
-        self._excluded, self._refused = tuple(excluded.values()), list(refused_evidence(events))
-        with self._engine.restoring():
-            for event in events:
-                if event.line not in refused and event.line not in excluded:
-                    with contextlib.suppress(EventRefused):  # the refusal is noted now: it was not recorded before
-                        self._take(event)
+        waiting = list(self._unwritten)
+        try:
+            self._restore(events)
+        except OneRefused:
+            self._together, self._unwritten = False, waiting
+            self._begin_with(self._make_engine(self.journal.model, self.config))
+            self._restore(events)
+        except EngineGone:
+            if self._together:
+                self._ended_at = None  # any of them may be the cause
+            self._together = False
+            raise
+        self._together = True
         if self._estimate is not None:
             self._estimate = self._engine.estimate
         self.engine = self._engine
         self._record_moves()
         self._write_waiting()
+
+    def _restore(self, events: Sequence[Event]) -> None:
+        """Have the engine take in recorded events."""
+        refused, excluded = refused_lines(events), excluded_shots(events)
+        self._excluded, self._refused = tuple(excluded.values()), list(refused_evidence(events))
+        with self._restoring():
+            for event in events:
+                if event.line not in refused and event.line not in excluded:
+                    with contextlib.suppress(EventRefused):  # the refusal is noted now: it was not recorded before
+                        self._take(event)
+
+    def _restoring(self) -> AbstractContextManager[None]:
+        if self._together and isinstance(self._engine, EngineProcess):
+            return self._engine.restoring_together()
+        return self._engine.restoring()
 
     def add(self, event: Estimating) -> OnlineEstimate | None:
         """Record an event, take it in, and return the estimate.
@@ -377,6 +399,9 @@ class LiveSession:
             self._take(event)
         except EventRefused:
             self._untaken.remove(event)
+            raise
+        except EngineGone:
+            self._together = False
             raise
         self._untaken.remove(event)
         self._record_moves()
