@@ -155,8 +155,10 @@ def test_no_bound_of_a_cell_is_above_the_cost_of_a_registration_in_it(case: str,
             first = first_intervals(of, threshold)
             assert first is not None
             intervals = Intervals(*(np.repeat(values, cells, axis=-1) for values in (first.centre, first.half)))
+            once = lower_bounds(of, centres, within, intervals, threshold)
             plain = narrowed(of, centres, within, intervals, threshold)
-            for found in (plain, sharper_bounds(of, centres, within, plain, threshold)):
+            sharper = [sharper_bounds(of, centres, within, bounds, threshold) for bounds in (once, plain)]
+            for found in (once, plain, *sharper):
                 assert found.possible.all()
                 assert (found.cost <= cost * (1.0 + 1e-6) + 1e-6).all()
                 outside = np.maximum(found.intervals.low - polar[..., None], polar[..., None] - found.intervals.high)

@@ -187,3 +187,32 @@ def test_a_spare_process_that_has_ended_or_is_of_other_settings_is_not_used(
     engine = engines(model, replace(config, limit_mm=2.0))
     assert engine.pid != spare
     assert spare not in engine_pids()
+
+
+def test_a_spare_process_that_hangs_is_not_used_nor_waited_for(case: Case, engines: EngineProcesses) -> None:
+    model, config = case[0], SolveConfig()
+    engines(model, config)
+    spare = started_spare(engines, model)
+    assert engines._spare is not None
+    assert engines._spare[2].answers(PATIENCE_S)
+    os.kill(spare, signal.SIGSTOP)
+    assert engines(model, config).pid != spare
+    assert spare not in engine_pids()
+    spare = started_spare(engines, model)
+    os.kill(spare, signal.SIGKILL)  # it may end between the check and its use
+    assert engines(model, config).alive
+
+
+def test_closed_engines_leave_no_spare_process_and_start_none(
+    case: Case, engines: EngineProcesses, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = engines(case[0], SolveConfig())
+    started_spare(engines, case[0])
+    with monkeypatch.context() as broken:
+        broken.setattr(EngineProcess, "close", lambda _self: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            engines.close()
+    others = engine_pids() - {engine.pid}
+    engines.keep_spare(case[0], SolveConfig())
+    assert engine_pids() - {engine.pid} == others
+    assert engines._spare is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -23,7 +24,7 @@ from fgreg.live.workflow import Workflow, WorkflowSettings
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.time_sync import Latencies
-from fgreg.online.engine_process import After, Call, EngineProcess, start_process
+from fgreg.online.engine_process import After, Call, EngineGone, EngineProcess, start_process
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import Engine, LiveSession
 from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
@@ -42,6 +43,9 @@ from fgreg.workers.worker_process import WorkerProcess
 MOST_WORK_S = 10.0
 """A registration without a new snapshot for longer is lost, also where its process still works: camera moves would go
 undetected."""
+
+PING_ANSWER_S = 0.5
+"""A spare process that takes longer to answer is not used."""
 
 OpenDevices = Callable[[ExitStack, SessionModel], Devices]
 """Opens all devices except the stage; they are closed with the stack."""
@@ -98,47 +102,66 @@ class Running:
 
 
 class EngineProcesses:
-    """Starts engine processes, one at a time: starting one ends the one before. For one thread."""
+    """Starts engine processes, one at a time: starting one ends the one before.
+
+    From any thread; after :meth:`close` no process is started for the next engine any more.
+    """
 
     def __init__(self) -> None:
         self._engine: EngineProcess | None = None
         self._spare: tuple[SessionModel, SolveConfig, WorkerProcess[Call, After]] | None = None
+        self._turn = threading.Lock()  # for _spare and _closed
+        self._closed = False
 
     def __call__(self, model: SessionModel, config: SolveConfig) -> EngineProcess:
         if self._engine is not None:
             self._engine.close()
             self._engine = None
-        self._engine = EngineProcess(model, config, self._take_spare(model, config))
+        spare = self._take_spare(model, config)
+        if spare is not None:
+            with suppress(EngineGone):  # it has ended just now
+                self._engine = EngineProcess(model, config, spare)
+        if self._engine is None:
+            self._engine = EngineProcess(model, config)
         return self._engine
 
     def keep_spare(self, model: SessionModel, config: SolveConfig) -> None:
         """Have a process ready for the next engine: its start, mostly imports, takes a second or two. Call it often."""
-        if self._spare is not None:
-            process = self._spare[2]
-            process.check()
-            if process.alive and not process.trouble:
+        with self._turn:
+            if self._closed:
                 return
-            process.close()
-        self._spare = model, config, start_process(model, config)
+            if self._spare is not None:
+                process = self._spare[2]
+                process.check()
+                if process.alive and not process.trouble:
+                    return
+                process.kill()
+            self._spare = model, config, start_process(model, config)
 
     def _take_spare(self, model: SessionModel, config: SolveConfig) -> WorkerProcess[Call, After] | None:
         """The spare process, if it is healthy and has this model and configuration."""
-        if self._spare is None:
+        with self._turn:
+            spare, self._spare = self._spare, None
+        if spare is None:
             return None
-        (of_model, of_config, process), self._spare = self._spare, None
-        process.check()
-        if of_model is model and of_config == config and process.alive and not process.trouble:
+        of_model, of_config, process = spare
+        fits = of_model is model and of_config == config
+        if fits and process.alive and (not process.ready or process.answers(PING_ANSWER_S)):
             return process
-        process.close()
+        process.kill()
         return None
 
     def close(self) -> None:
         """End the processes."""
-        if self._engine is not None:
-            self._engine.close()
-        if self._spare is not None:
-            self._spare[2].close()
-            self._spare = None
+        with self._turn:
+            self._closed = True
+            spare, self._spare = self._spare, None
+        try:
+            if spare is not None:
+                spare[2].kill()
+        finally:
+            if self._engine is not None:
+                self._engine.close()
 
 
 class NewestSnapshots:
@@ -242,11 +265,11 @@ def running(
             stack.callback(overlay.close)
 
         def on_event(event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:
-            make_engine.keep_spare(model, session.config)
             if overlay is not None:
                 overlay.taken(event, estimate, marker_T_laser)
             if on_taken is not None:
                 on_taken(event, estimate, marker_T_laser)
+            make_engine.keep_spare(model, session.config)
 
         recorder = Recorder(session, on_event)
         stack.callback(_end_recording, recorder, say)

@@ -210,14 +210,18 @@ class EngineProcess:
 
     @contextmanager
     def restoring_together(self) -> Iterator[None]:
-        """The same with few calls: each one waits for other threads. Raises EngineGone, OneRefused."""
-        with self.restoring():
-            self._together = []
-            try:
-                yield
-                self._send_together()
-            finally:
-                self._together = None
+        """The same with few calls: each one waits for other threads. Raises EngineGone, OneRefused.
+
+        Where that fails, this engine is of no more use.
+        """
+        self._call("restore")
+        self._together = []
+        try:
+            yield
+            self._send_together()
+        finally:
+            self._together = None
+        self._call("restored")
 
     @property
     def estimate(self) -> OnlineEstimate | None:

@@ -242,11 +242,11 @@ class LiveSession:
 
     def _take_up(self, events: Sequence[Event]) -> None:
         """Take in recorded events, with one estimate at the end."""
-        waiting = list(self._unwritten)
+        waiting, before = list(self._unwritten), self._estimate
         try:
             self._restore(events)
         except OneRefused:
-            self._together, self._unwritten = False, waiting
+            self._together, self._unwritten, self._estimate = False, waiting, before
             self._begin_with(self._make_engine(self.journal.model, self.config))
             self._restore(events)
         except EngineGone:

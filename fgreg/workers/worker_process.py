@@ -7,6 +7,7 @@ as the registration does. Nor do they detect a process that hangs while it is id
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import threading
@@ -155,10 +156,27 @@ class WorkerProcess(Generic[Request, Answer]):
         if self._child is not None and self._awaited is None and time.monotonic() - self._received_s > PING_S:
             self._post(self._child, "ping", None)
 
+    def answers(self, wait_s: float) -> bool:
+        """Whether the idle process answers a ping within ``wait_s``."""
+        self._advance(0.0)
+        if self._child is not None and self._awaited is None:
+            self._post(self._child, "ping", None)
+        until = time.monotonic() + wait_s
+        while self._awaited is not None and (left_s := until - time.monotonic()) > 0.0:
+            self._advance(left_s)
+        return self._child is not None and self._awaited is None
+
     def close(self) -> None:
         """End the process."""
+        self._close(self._end_s)
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self._close(0.0)
+
+    def _close(self, patience_s: float) -> None:
         self._restart, self._waiting = False, None
-        self._end(self._end_s)
+        self._end(patience_s)
         self.trouble = "it is closed"
 
     def _start(self) -> None:
@@ -296,7 +314,13 @@ class _Child:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._messages: SimpleQueue[memoryview | None] = SimpleQueue()
         self._writer = threading.Thread(target=self._write, name=f"to {name}", daemon=True)
-        self._writer.start()
+        try:
+            self._writer.start()
+        except RuntimeError as error:  # the system gives no more threads
+            self.process.kill()
+            self.process.join(KILL_S)
+            self.connection.close()
+            raise OSError(errno.EAGAIN, str(error)) from error
 
     def _write(self) -> None:
         with suppress(OSError):  # of a process that has ended
