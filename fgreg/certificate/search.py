@@ -168,7 +168,7 @@ def _ball(of: Conditional, known: Intervals, threshold: float, enough: float) ->
     """The largest radius about the estimate's rotation that is known to hold no lower cost than ``enough``."""
     rotation = np.repeat(of.rotation[..., None], len(BALLS), axis=-1)
     reach = Reach.ball(BALLS)
-    bounds = narrowed(of, rotation, reach, _repeated(known, len(BALLS)), threshold)
+    bounds = lower_bounds(of, rotation, reach, _repeated(known, len(BALLS)), threshold)
     bounds = sharper_bounds(of, rotation, reach, bounds, threshold)
     good = bounds.cost >= enough
     return float(BALLS[good].max()) if good.any() else 0.0
