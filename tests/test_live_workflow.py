@@ -255,7 +255,7 @@ def test_an_epoch_that_stays_refused_is_reported_with_what_helps() -> None:
 
 
 def test_a_bump_after_few_pms_ends_in_following_all_the_same() -> None:
-    session = rehearsal(4)
+    session = rehearsal(4, frame_s=1.0 / 30.0)
     settings = WorkflowSettings(aims=8, pms=8, most_pms=9, hearing_threshold=session.threshold)
     session.workflow = Workflow(session.model, settings)
     while sum(isinstance(a, TakePairs) for _, a in session.actions) < 2:

@@ -22,8 +22,9 @@ ROUNDS = 15
 """Largest number of times that a thorough search narrows the intervals of a cell before it is halved."""
 NARROWED = 0.96
 """Intervals that narrow to more than this part of what they were are not narrowed again."""
-EASY = 40_000
-"""Cells times PMs up to which a search is not thorough: with first hits it mostly ends before, and sooner."""
+EASY = 2_700
+"""Cells up to which a search is not thorough: with first hits it mostly ends before, and sooner. With few PMs, whose
+intervals stay wide, it takes more of them."""
 AT_ONCE = 12_000
 """Number of cells times PMs that are bounded in one call: more do not stay in the cache."""
 NEAR = 0.5
@@ -103,7 +104,7 @@ def search(
         cells, intervals = cells.take(outside), intervals.take(outside)
         if not len(cells):
             break
-        region = _bounded(of, cells, intervals, threshold, thorough=spent + looked_at > EASY)
+        region = _bounded(of, cells, intervals, threshold, thorough=spent + looked_at > EASY * count)
         looked_at += len(cells) * count
         cost, left = region.bounds.cost, region.bounds.possible & (region.bounds.cost < enough)
         aside = region.bounds.possible & ~left
